@@ -18,7 +18,7 @@ from tests.carla.stand_in import REPOSITORY, StandIn, free_tcp_pair, need_carla,
 from lavt.assembly.vehicles import carla_settings
 from lavt.domain import Actuation
 from lavt.errors import UserError, VehicleError
-from lavt.vehicle.carla import library, session
+from lavt.vehicle.carla import connection, library, session
 from lavt.vehicle.carla.session import BRAKED, CarlaSession
 from lavt.vehicle.sim.road.road import load_road
 
@@ -143,8 +143,12 @@ def test_an_occupied_start_is_named() -> None:
         assert server.ask("settings") == "False [False]"
 
 
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
 def test_the_leftovers_of_a_killed_run_are_removed(server: StandIn) -> None:
-    """A killed run leaves a frozen world; the next run removes its actors, and in the end the world runs again."""
+    """A killed run leaves a frozen world; the next run removes its actors, and only then can the world run again."""
     killed = subprocess.run(
         [sys.executable, "-c", KILLED_CLIENT, str(server.port)],
         cwd=REPOSITORY,
@@ -155,6 +159,12 @@ def test_the_leftovers_of_a_killed_run_are_removed(server: StandIn) -> None:
     assert killed.returncode == -9
     assert server.ask("actors") == CAR_AND_SENSORS
     assert server.ask("settings").startswith("True")
+    with pytest.MonkeyPatch.context() as patch:  # a start that ends before the actors are removed
+        patch.setattr(connection, "_remove_leftovers", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            CarlaSession(blind_settings(server.port)[0])
+    assert server.ask("actors") == CAR_AND_SENSORS
+    assert server.ask("settings").startswith("True"), "the car of the killed run could drive on"
     frame = server.ask("frame")
     with closing(CarlaSession(blind_settings(server.port)[0])) as opened:
         assert int(frame) < opened.snapshot.frame

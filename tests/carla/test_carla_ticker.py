@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lavt.domain import NS_PER_MS, Actuation
+from lavt.domain import NS_PER_MS, Actuation, CameraModel
+from lavt.vehicle.carla.camera import CarlaCamera
 from lavt.vehicle.carla.frames import FlatPose
 from lavt.vehicle.carla.settings import CarlaEvent, Snapshot
 from lavt.vehicle.carla.ticker import FULL_BRAKE, CommandHistory, Ticker
@@ -65,7 +69,7 @@ def test_a_command_is_in_force_for_its_part_of_a_tick() -> None:
 
 
 def test_the_thread_brakes_when_the_actuator_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the actuator has not looked for ticks for more than 200 ms, the car brakes until the next command."""
+    """While the actuator has not looked for ticks for more than 200 ms, the car brakes in each tick."""
     world = RecordedWorld()
     ticker = build(world)
     monkeypatch.setattr(ticker, "_is_threaded", True)
@@ -75,11 +79,48 @@ def test_the_thread_brakes_when_the_actuator_is_silent(monkeypatch: pytest.Monke
         ticker.brake_if_silent(START_NS + after_ms * NS_PER_MS)
         assert ticker.counts["silences"] == silences
     monkeypatch.setattr(ticker, "_is_threaded", False)
-    ticker.tick_until(START_NS + 400 * NS_PER_MS)
+    ticker.tick_until(START_NS + 100 * NS_PER_MS)
     assert world.actuations[-1] == (FULL_BRAKE, False)
-    ticker.command(Actuation(0.1, 0.5, 0.0), START_NS + 400 * NS_PER_MS, hand_brake=False)
-    ticker.tick_until(START_NS + 500 * NS_PER_MS)
+    ticker.command(Actuation(0.1, 0.5, 0.0), START_NS + 100 * NS_PER_MS, hand_brake=False)
+    monkeypatch.setattr(ticker, "_is_threaded", True)
+    ticker.brake_if_silent(START_NS + 950 * NS_PER_MS)  # a last command of an actuator that hangs again
+    assert ticker.counts["silences"] == 1
+    monkeypatch.setattr(ticker, "_is_threaded", False)
+    ticker.tick_until(START_NS + 200 * NS_PER_MS)
+    assert world.actuations[-1] == (FULL_BRAKE, False)
+    monkeypatch.setattr(ticker, "_is_threaded", True)
+    ticker.tick_until(START_NS + 1000 * NS_PER_MS)
+    ticker.brake_if_silent(START_NS + 1001 * NS_PER_MS)
+    monkeypatch.setattr(ticker, "_is_threaded", False)
+    ticker.command(Actuation(0.1, 0.5, 0.0), START_NS + 200 * NS_PER_MS, hand_brake=False)
+    ticker.tick_until(START_NS + 300 * NS_PER_MS)
     assert world.actuations[-1] == (Actuation(0.1, 0.5, 0.0), False)
+
+
+def test_the_camera_is_not_taken_for_the_actuator(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In real time, pictures that the camera node asks for do not hide that the actuator is silent."""
+    ticker = build(RecordedWorld())
+    monkeypatch.setattr(ticker, "_is_threaded", True)
+    ticker.tick_until(START_NS)
+    session: Any = SimpleNamespace(settings=SimpleNamespace(tick_timeout_s=1.0))
+    camera = CarlaCamera(session, CameraModel(), rate_hz=1000.0, phase_ns=0, sensor_delay_ns=0)
+    camera.ticker = ticker
+    assert camera.capture(1, START_NS + 900 * NS_PER_MS, None) is None
+    ticker.brake_if_silent(START_NS + 901 * NS_PER_MS)
+    assert ticker.counts["silences"] == 1
+
+
+def test_commands_during_a_stall_do_not_count_after_it() -> None:
+    """A tick after skipped ones has the commands of its own period, not the older ones of the stall."""
+    world = RecordedWorld()
+    ticker = build(world)
+    ticker.tick_until(START_NS)
+    ticker.command(Actuation(0.4, 1.0, 0.0), START_NS, hand_brake=False)
+    ticker.command(FULL_BRAKE, START_NS + 5000 * NS_PER_MS, hand_brake=False)
+    ticker.skip(5000 * NS_PER_MS)
+    assert ticker.next_due_ns == START_NS + 5200 * NS_PER_MS
+    ticker.tick_until(START_NS + 5200 * NS_PER_MS)
+    assert world.actuations[-1] == (FULL_BRAKE, False)
 
 
 @given(COMMANDS)

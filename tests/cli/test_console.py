@@ -79,6 +79,16 @@ def test_the_first_interrupt_says_what_is_finished(capsys: pytest.CaptureFixture
     assert capsys.readouterr().err.count("finishing the runs in progress; Ctrl-C again ends at once") == 1
 
 
+def test_an_ignored_ctrl_c_stays_ignored_by_long_work() -> None:
+    """Ctrl-C for another program does not end a sweep that a shell script has started in the background."""
+    former_handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with console.interruptible("runs"):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, former_handler)
+
+
 def test_an_ignored_hangup_stays_ignored() -> None:
     """Under nohup, a closed terminal ends neither long work nor a program that runs until it is stopped."""
     former_handler = signal.signal(signal.SIGHUP, signal.SIG_IGN)

@@ -127,8 +127,9 @@ def interruptible(in_progress: str = "") -> Iterator[None]:
         raise KeyboardInterrupt
 
     queue_output("stderr")
+    is_ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN  # as in the background of a shell script
     try:
-        with _signal_handlers(interrupt, signal.SIGINT, signal.SIGTERM):
+        with _signal_handlers(interrupt, signal.SIGTERM, *(() if is_ignored else (signal.SIGINT,))):
             yield
     except KeyboardInterrupt:
         raise WorkError("stopped; the finished results are kept") from None

@@ -71,6 +71,8 @@ class EffectDelay:
             sent_ns = at_ns if sequence == state.applied_sequence else None
         if sent_ns is None or before is None or before.instance != state.instance:
             return
+        if state.sent_wall_ns <= before.sent_wall_ns:  # the vehicle's clock was set back
+            self._bounds.clear()
         if 0 < state.sent_wall_ns - before.sent_wall_ns <= STATE_GAP_NS:
             self._bounds.append((now_ns, before.sent_wall_ns - sent_ns, state.sent_wall_ns - sent_ns))
 

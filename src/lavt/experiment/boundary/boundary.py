@@ -227,9 +227,11 @@ class _SearchProgress:
             for future in as_completed(list(futures)):
                 take(future)
         except KeyboardInterrupt:
-            workers.stop()
-            for future in [future for future in futures if not future.cancelled()]:
-                take(future)
+            try:
+                workers.stop()
+            finally:  # a second Ctrl-C breaks off only what has not finished
+                for future in [future for future in futures if future.done() and not future.cancelled()]:
+                    take(future)
             raise
         return [search for search in todo if search.name in broken]
 
@@ -259,6 +261,7 @@ def search_boundary(
 
     Returns the content of `boundary.json`, and whether all searches were run.
     """
+    jobs = 1 if config.vehicle.kind == "carla" else jobs  # only one client can tick a CARLA server
     found, failed, is_complete = run_searches(searches, jobs=jobs, on_progress=on_progress)
     content = {
         "schema": 1,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import TracebackType
 from typing import Any
 
@@ -41,6 +41,12 @@ def check_netem(planned: PlannedRun) -> list[str]:
 def uses_netem(planned: PlannedRun) -> bool:
     """Return whether netem injects the delay of a run."""
     return planned.config.time == "real" and planned.config.network.injection == "netem"
+
+
+def restore_abandoned(planned: Iterable[PlannedRun]) -> None:
+    """Restore the loopback interface if netem delayed one of these runs, and its process was killed before it could."""
+    if any(map(uses_netem, planned)):
+        NetemInterface(LOOPBACK).restore()
 
 
 class NetemRun:

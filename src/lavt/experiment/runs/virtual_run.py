@@ -113,10 +113,18 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
         fidelity=fidelity,
         lazy_physics=True,
     )
-    client = build_client(
-        client_config(config, seed), lambda: client_clock.now_at(0), SeededEntropy(seed, "client"), fidelity=fidelity
-    )
-    make_directory(out)
+    try:
+        client = build_client(
+            client_config(config, seed),
+            lambda: client_clock.now_at(0),
+            SeededEntropy(seed, "client"),
+            fidelity=fidelity,
+        )
+        make_directory(out)
+    except BaseException:
+        if server.setup.close is not None:
+            server.setup.close()
+        raise
     digest = hashlib.sha256()
     left_out = config.left_out
     server_writer = RecordWriter(out / "server.mcap", "server", digest, left_out=left_out)

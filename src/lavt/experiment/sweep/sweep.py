@@ -22,6 +22,7 @@ from lavt.domain import NS_PER_S
 from lavt.errors import UserError, WorkError, describe_error
 from lavt.experiment.analysis.drive_data import DriveData
 from lavt.experiment.analysis.results import FAILED, read_json, write_json
+from lavt.experiment.runs.netem_run import restore_abandoned
 from lavt.experiment.runs.plan import PlannedRun, plan_sweep
 from lavt.experiment.runs.remote_run import RemoteServer
 from lavt.experiment.runs.run import CONFIG, RESULT, config_text, drive_once
@@ -72,8 +73,11 @@ def run_all(
     progress = _SweepProgress(runs_dir, on_progress, drive_once if server is None else server.drive)
     if cluster_address is None:
         jobs = 1 if any(_drives_alone(run.config) for run in todo) else jobs or os.cpu_count() or 1
-        for run in attempt_in_processes(progress.drive, todo, jobs):
-            progress.fail(run, "each of the processes that drove it died")
+        try:
+            for run in attempt_in_processes(progress.drive, todo, jobs):
+                progress.fail(run, "each of the processes that drove it died")
+        finally:
+            restore_abandoned(todo)  # a second Ctrl-C kills the processes
     elif todo:
         with cluster_workers(cluster_address, jobs) as workers:
             jobs = workers.jobs

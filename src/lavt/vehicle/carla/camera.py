@@ -47,11 +47,11 @@ class CarlaCamera:
         ticker, timeout_s = self.ticker, self._session.settings.tick_timeout_s
         if ticker is None:
             return None
-        ticker.tick_until(at_ns)
-        if ticker.is_threaded:
+        if ticker.is_threaded:  # then only the actuator may look for ticks, because its silence brakes
             ticked = ticker.wait_for_tick(max(self._last_ns, at_ns - round(0.5e9 / self.rate_hz)), 1 / self.rate_hz)
             timeout_s = 1 / self.rate_hz
         else:
+            ticker.tick_until(at_ns)
             ticked = ticker.ticked_at(at_ns)
         if ticked is None or ticked.due_ns <= self._last_ns:
             return None

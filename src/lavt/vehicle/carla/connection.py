@@ -104,14 +104,17 @@ def open_world(carla: Any, client: Any, settings: CarlaSettings) -> OpenedWorld:
         before = world.get_settings()
         opened = OpenedWorld(world, _settings_to_restore(carla, before), world.get_weather())
         world.apply_settings(_own_settings(carla, before, settings))
+        may_run = not before.synchronous_mode
         try:
             world.tick(settings.timeout_s)  # without a tick, a frozen world shows no actors
-            _remove_leftovers(world, settings.role_name)
+            _remove_leftovers(carla, world, settings)
+            may_run = True
             if weather is not None:
                 world.set_weather(weather)
         except BaseException:
-            with suppress(RuntimeError):
-                opened.restore(has_own_weather=False)
+            if may_run:  # a world that was found frozen may hold the car of a killed run, which would drive on
+                with suppress(RuntimeError):
+                    opened.restore(has_own_weather=False)
             raise
     return opened
 
@@ -188,8 +191,14 @@ def _find_weather(carla: Any, name: str) -> Any:
     return weather
 
 
-def _remove_leftovers(world: Any, role_name: str) -> None:
-    """Destroy the actors of a killed run: those with our role name, the newest first."""
-    ours = [actor for actor in world.get_actors() if actor.attributes.get("role_name") == role_name]
+def _remove_leftovers(carla: Any, world: Any, settings: CarlaSettings) -> None:
+    """Destroy the actors of a killed run: those with our role name, the newest first; brake a car that stays."""
+    ours = [actor for actor in world.get_actors() if actor.attributes.get("role_name") == settings.role_name]
     for actor in sorted(ours, key=lambda actor: actor.id, reverse=True):
-        actor.destroy()
+        if not actor.destroy():
+            if actor.type_id.startswith("vehicle."):
+                actor.apply_control(carla.VehicleControl(brake=1.0, hand_brake=True))
+            raise VehicleError(
+                f"the CARLA server at {settings.address} did not remove {actor.type_id}, which a killed run left: "
+                "restart it"
+            )

@@ -129,8 +129,8 @@ class CarlaSession:
     def close(self) -> None:
         """Destroy the actors in reverse order and restore the world's settings.
 
-        The settings come last, because with them the world may run by itself again. If the server does not answer, the
-        world stays frozen, with the rest of the actors, until the next session removes them.
+        The settings come last, because with them the world may run by itself again. If the server does not answer or
+        the car stays, the world stays frozen, with the rest of the actors, until the next session removes them.
         """
         if self._is_closed:
             return
@@ -141,6 +141,9 @@ class CarlaSession:
             for actor in reversed(self._actors):
                 if actor.type_id.startswith("sensor."):
                     actor.stop()
+                    actor.destroy()  # whether it succeeds: another client may have destroyed it
+                    continue
+                self._apply(BRAKED, hand_brake=True)
                 if not actor.destroy():
                     return
             if self._opened is not None:

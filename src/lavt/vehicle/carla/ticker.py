@@ -97,6 +97,7 @@ class Ticker:
         self._is_threaded = False
         self._heard_ns: int | None = None
         """When the actuator last looked for ticks of the thread; None: it has not yet."""
+        self._is_silent = False
         self._stopped = threading.Event()
         self._failed: BaseException | None = None
         self._thread: threading.Thread | None = None
@@ -141,12 +142,12 @@ class Ticker:
             self._tick(self.next_due_ns)
 
     def brake_if_silent(self, now_ns: int) -> None:
-        """Brake fully if the actuator has not looked for ticks for `SILENCE_NS`, until its next command."""
+        """Brake fully in the next tick if the actuator has not looked for ticks for `SILENCE_NS`."""
         heard_ns = self._heard_ns
-        if heard_ns is not None and now_ns - heard_ns > SILENCE_NS:
-            self._heard_ns = None  # until the actuator is heard again
-            self._counts["silences"] += 1
-            self.command(FULL_BRAKE, now_ns, hand_brake=False)
+        was_silent, self._is_silent = self._is_silent, heard_ns is not None and now_ns - heard_ns > SILENCE_NS
+        if self._is_silent:
+            self._counts["silences"] += not was_silent
+            self.command(FULL_BRAKE, self._last_due_ns, hand_brake=False)
 
     def ticked_at(self, at_ns: int) -> Ticked | None:
         """Return the newest tick that was due by `at_ns`; None if it is forgotten or there was none."""
@@ -190,7 +191,7 @@ class Ticker:
                     self._stopped.wait(-late_ns / NS_PER_S)
                     continue
                 if late_ns > self._period_ns // 2:
-                    self._skip(late_ns)
+                    self.skip(late_ns)
                     continue
                 self._counts["ticks_begun_late"] += late_ns > LATE_NS
                 self.brake_if_silent(clock.now().mono_ns)
@@ -198,14 +199,15 @@ class Ticker:
         except BaseException as error:  # the actuator node raises it and so ends the run
             self._failed = error
 
-    def _skip(self, late_ns: int) -> None:
+    def skip(self, late_ns: int) -> None:
         """Move the grid by whole periods, so that the next tick is due in the future and still at a frame's time.
 
-        The world stood still meanwhile: it lost this time.
+        The world stood still meanwhile: it lost this time, and what was commanded then does not count.
         """
         periods = 1 + late_ns // self._period_ns
         with self._lock:
             self._anchor_ns += periods * self._period_ns
+            self._last_due_ns = self.next_due_ns - self._period_ns
             self._counts["ticks_skipped"] += periods
 
     def _tick(self, due_ns: int) -> None:
