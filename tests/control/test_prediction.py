@@ -160,6 +160,7 @@ def test_the_car_moves_only_after_the_picture() -> None:
 @pytest.mark.parametrize("speed_mps", [math.nan, math.inf, -math.inf, -0.5, MAX_REPORTED_MPS])
 @pytest.mark.parametrize("index", [0, 3, -1])
 def test_an_impossible_speed_gives_no_prediction(speed_mps: float, index: int) -> None:
+    """A report of a speed that is not finite, backwards or beyond any vehicle's gives no prediction."""
     reports = motions(8.0, 0.1, NS_PER_S // 10)
     reports[index] = reports[index]._replace(speed_mps=speed_mps)
     assert predict(CAR, reports, [], PICTURE_NS, PICTURE_NS + NS_PER_S) is None
@@ -167,6 +168,7 @@ def test_an_impossible_speed_gives_no_prediction(speed_mps: float, index: int) -
 
 @pytest.mark.parametrize("steering_rad", [math.nan, math.inf, -math.inf])
 def test_steering_that_is_not_finite_gives_no_prediction(steering_rad: float) -> None:
+    """A steering angle that is not finite, commanded or reported, gives no prediction."""
     reports = motions(8.0, 0.1, NS_PER_S // 10)
     commands = [SteeringCommand(PICTURE_NS, steering_rad)]
     assert predict(CAR, reports, commands, PICTURE_NS, PICTURE_NS + NS_PER_S) is None
@@ -190,4 +192,5 @@ def test_missing_reports_give_no_prediction() -> None:
 
 @pytest.mark.parametrize("loop_ns", [-1, MAX_LOOP_NS + 1])
 def test_an_impossible_loop_delay_gives_no_prediction(loop_ns: int) -> None:
+    """An effect before the picture, or later than the longest loop delay, gives no prediction."""
     assert predict(CAR, motions(8.0, 0.0, 0), [], PICTURE_NS, PICTURE_NS + loop_ns) is None

@@ -217,6 +217,18 @@ def test_the_delay_is_known_to_half_the_states_period(delay_ns: int, phase_ns: i
     assert delay.at_ns(sent[-1][1] + NS_PER_S) is None
 
 
+def test_a_clock_that_is_set_back_forgets_the_delay() -> None:
+    """After the vehicle's clock was set back, the delay is unknown until a newly applied command bounds it again."""
+    delay = EffectDelay()
+    for number in range(4):
+        delay.note_command(number, number * STEP_NS)
+    for number, clock_ns in ((0, 0), (1, 0), (2, -NS_PER_S), (3, -NS_PER_S)):
+        delay.note_state(state(number * STEP_NS + clock_ns, number), number * STEP_NS)
+        if number == 2:
+            assert delay.at_ns(number * STEP_NS) is None
+    assert delay.at_ns(3 * STEP_NS) == WALL_NS - NS_PER_S - STEP_NS // 2
+
+
 def test_an_outline_that_is_not_in_view_is_left_out() -> None:
     """The camera sees no point of a car that stands beneath it; no point is far outside the picture."""
     here = (RelativePose(0.0, 0.0, 0.0),)

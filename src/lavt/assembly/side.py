@@ -144,7 +144,7 @@ class Side:
             "console": links.console,
             "relay": links.relay,
         }
-        if self._setup is not None and self._setup.run is not None:
+        if self._setup is not None:
             self._setup.run(self.clock)
         self.runtime.start({carrier: link for carrier, link in carriers.items() if link is not None})
         if links.console is not None:
@@ -177,7 +177,7 @@ class Side:
                     parts.callback(link.close)
             parts.callback(self._time_source.close)
             parts.callback(self._injector.close)
-            if self._setup is not None and self._setup.close is not None:
+            if self._setup is not None:
                 parts.callback(self._setup.close)
             parts.callback(self.runtime.stop)
             if self.actuator is not None:
@@ -225,8 +225,7 @@ def open_server(
         links = Links(video, probe, opened.enter_context(closing(_open_zenoh(config, clock, print_message))))
         host = kernel_identity()
         nodes = build_server(config, clock.now, MachineEntropy(), host=host, video_port=video.port)
-        if nodes.setup.close is not None:
-            opened.callback(nodes.setup.close)
+        opened.callback(nodes.setup.close)
         ready: dict[str, Any] = {"video_port": video.port, "probe_port": probe.port}
         if config.zenoh.is_embedded:
             ready["locators"] = links.zenoh.locators()

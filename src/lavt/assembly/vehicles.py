@@ -56,10 +56,10 @@ class VehicleSetup:
     simulated: bool = False
     catches_up: bool = False
     """Whether a late call of the vehicle's `advance` loses no accuracy."""
-    run: Callable[[Clock], None] | None = None
-    """Starts the vehicle's own thread in real time; None: it has none."""
-    close: Callable[[], None] | None = None
-    """Ends the vehicle's connections; None: it has none."""
+    run: Callable[[Clock], None] = lambda _clock: None
+    """Starts the vehicle's own thread in real time, if it has one."""
+    close: Callable[[], None] = lambda: None
+    """Ends the vehicle's own thread and connections, if it has any."""
 
 
 def build_simulator(config: ServerConfig) -> VehicleSetup:

@@ -50,7 +50,8 @@ def check(
     """Check whether a CARLA server does what LAVT assumes, and write a log.
 
     The command spawns a car at a place that the town recommends, drives it, steers it, and measures how long ticks and
-    pictures take. LAVT was never tried with a real server: please send the log in. Exits with 1 if a check failed.
+    pictures take. LAVT was never tried with a real server: please attach the log to an issue.
+    Exits with 1 if a check failed.
 
     Example: lavt carla check 192.0.2.7 --set vehicle.carla.town=Town04
     """
@@ -76,9 +77,9 @@ def check(
             "ticks": msgspec.to_builtins(times),
             "provenance": provenance(),
         }
-    out.write_bytes(msgspec.json.format(msgspec.json.encode(log), indent=2) + b"\n")
     for item in checks:
         console.print_result(f"{'ok    ' if item.passed else 'FAILED'}  {item.name}: {item.detail}")
+    out.write_bytes(msgspec.json.format(msgspec.json.encode(log), indent=2) + b"\n")
     console.print_result(f"the log is {out}")
     if not all(item.passed for item in checks):
         raise WorkError("the server does not do what LAVT assumes: see the failed checks")

@@ -427,12 +427,15 @@ def test_searches_of_a_dead_process_are_repeated(monkeypatch: pytest.MonkeyPatch
     assert completed
 
 
-def test_ctrl_c_keeps_the_found_boundaries(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """After Ctrl-C, started searches are finished, no search is started, and the files have all results."""
+@pytest.mark.parametrize("interrupts", [1, 2])
+def test_ctrl_c_keeps_the_found_boundaries(interrupts: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """After Ctrl-C, no search is started, and the files have all finished ones, also after a second Ctrl-C."""
     monkeypatch.setattr(boundary_module, "run_search", lambda search: run_entry("a_key", int(search.name[-2:])))
     monkeypatch.setattr("lavt.experiment.sweep.workers.process_workers", in_this_process)
     monkeypatch.setattr(_InThisProcess, "max_calls", 3)
     lines: list[str] = []
+    if interrupts == 2:
+        monkeypatch.setattr(_InThisProcess, "shutdown", interrupt)
 
     def interrupt_after_two(line: str) -> None:
         lines.append(line)
@@ -448,6 +451,10 @@ def test_ctrl_c_keeps_the_found_boundaries(monkeypatch: pytest.MonkeyPatch, tmp_
     assert json.loads((tmp_path / "boundary.json").read_text()) == result
     assert (tmp_path / "boundary.csv").read_text().count("\n") == 4
     assert (tmp_path / "boundary.png").stat().st_size > 1000
+
+
+def interrupt(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
 
 
 class _InThisProcess:

@@ -28,7 +28,7 @@ from lavt.experiment.report.files import save_figure
 from lavt.experiment.runs.monitored_run import MonitoredRun, drive_monitored
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.experiment.statistics.boundary_summary import CRITERIA, summarize_groups
-from lavt.experiment.sweep.workers import Workers, attempt_in_processes
+from lavt.experiment.sweep.workers import Workers, attempt_in_processes, drives_alone
 
 BOUNDARY = "boundary.json"
 CSV_COLUMNS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
@@ -261,7 +261,7 @@ def search_boundary(
 
     Returns the content of `boundary.json`, and whether all searches were run.
     """
-    jobs = 1 if config.vehicle.kind == "carla" else jobs  # only one client can tick a CARLA server
+    jobs = 1 if any(drives_alone(search.planned.config) for search in searches) else jobs
     found, failed, is_complete = run_searches(searches, jobs=jobs, on_progress=on_progress)
     content = {
         "schema": 1,

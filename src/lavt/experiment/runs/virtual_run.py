@@ -100,31 +100,10 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     Raises `UserError` for an invalid config, before the directory is created.
     """
     config, seed = planned.config, planned.seed
+    server_clock, client_clock = clocks or host_clocks(config)
+    server, client = _build_nodes(config, seed, server_clock, client_clock, out)
     costs = read_costs() if config.costs == "measured" else read_costs().constant
     requested = planned.requested
-    server_clock, client_clock = clocks or host_clocks(config)
-    fidelity = FIDELITIES[config.fidelity]()
-    server = build_server(
-        server_config(config, seed),
-        lambda: server_clock.now_at(0),
-        SeededEntropy(seed, "server"),
-        host="virtual-server",
-        video_port=SERVER_VIDEO_PORT,
-        fidelity=fidelity,
-        lazy_physics=True,
-    )
-    try:
-        client = build_client(
-            client_config(config, seed),
-            lambda: client_clock.now_at(0),
-            SeededEntropy(seed, "client"),
-            fidelity=fidelity,
-        )
-        make_directory(out)
-    except BaseException:
-        if server.setup.close is not None:
-            server.setup.close()
-        raise
     digest = hashlib.sha256()
     left_out = config.left_out
     server_writer = RecordWriter(out / "server.mcap", "server", digest, left_out=left_out)
@@ -159,6 +138,34 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     injected = injected_network(network.inherent, requested, costs, seed, state_delay=network.state_delay)
     runtime = VirtualRuntime(hosts, virtual_links(injected, costs, seed))
     return VirtualLoop(runtime, server, client, observer, (server_writer, client_writer), digest)
+
+
+def _build_nodes(
+    config: RunConfig, seed: int, server_clock: HostClock, client_clock: HostClock, out: Path
+) -> tuple[ServerNodes, ClientNodes]:
+    """Build the nodes of both sides, and create `out`; after an error, close the vehicle's connections."""
+    fidelity = FIDELITIES[config.fidelity]()
+    server = build_server(
+        server_config(config, seed),
+        lambda: server_clock.now_at(0),
+        SeededEntropy(seed, "server"),
+        host="virtual-server",
+        video_port=SERVER_VIDEO_PORT,
+        fidelity=fidelity,
+        lazy_physics=True,
+    )
+    try:
+        client = build_client(
+            client_config(config, seed),
+            lambda: client_clock.now_at(0),
+            SeededEntropy(seed, "client"),
+            fidelity=fidelity,
+        )
+        make_directory(out)
+    except BaseException:
+        server.setup.close()
+        raise
+    return server, client
 
 
 def _annotate(writer: RecordWriter, costs: Costs, requested: Condition) -> None:
@@ -245,8 +252,7 @@ def drive(loop: VirtualLoop, *, limit_ns: int = RUN_LIMIT_NS, progress: Callable
         runtime.close()
     finally:
         gc.unfreeze()
-        if loop.server.setup.close is not None:
-            loop.server.setup.close()
+        loop.server.setup.close()
         for writer in loop.writers:
             writer.close()
 

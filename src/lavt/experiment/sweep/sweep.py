@@ -27,7 +27,14 @@ from lavt.experiment.runs.plan import PlannedRun, plan_sweep
 from lavt.experiment.runs.remote_run import RemoteServer
 from lavt.experiment.runs.run import CONFIG, RESULT, config_text, drive_once
 from lavt.experiment.sweep.cluster import cluster_workers
-from lavt.experiment.sweep.workers import DriveRun, Workers, attempt_in_processes, is_finished, remove_unfinished
+from lavt.experiment.sweep.workers import (
+    DriveRun,
+    Workers,
+    attempt_in_processes,
+    drives_alone,
+    is_finished,
+    remove_unfinished,
+)
 from lavt.recording.output_directory import prepare_directory
 
 SWEEP = "sweep.yaml"
@@ -72,7 +79,7 @@ def run_all(
     todo = [run for run in planned if not is_finished(runs_dir / run.name)]
     progress = _SweepProgress(runs_dir, on_progress, drive_once if server is None else server.drive)
     if cluster_address is None:
-        jobs = 1 if any(_drives_alone(run.config) for run in todo) else jobs or os.cpu_count() or 1
+        jobs = 1 if any(drives_alone(run.config) for run in todo) else jobs or os.cpu_count() or 1
         try:
             for run in attempt_in_processes(progress.drive, todo, jobs):
                 progress.fail(run, "each of the processes that drove it died")
@@ -93,11 +100,6 @@ def run_all(
         "jobs": jobs,
     }
     return sweep_result, speed
-
-
-def _drives_alone(config: RunConfig) -> bool:
-    """Return whether a run must be the only one: it is in real time, or its client must be the only one of a server."""
-    return config.time == "real" or config.vehicle.kind == "carla"
 
 
 class _SweepProgress:

@@ -16,6 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
+from lavt.config import RunConfig
 from lavt.experiment.analysis.drive_data import DriveData, read_drive
 from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import PlannedRun
@@ -78,6 +79,11 @@ def attempt_in_processes(
             with process_workers(processes) as workers:
                 todo = attempt(workers, todo)
     return todo
+
+
+def drives_alone(config: RunConfig) -> bool:
+    """Return whether no other run may be driven beside this one: in real time, or in a CARLA server."""
+    return config.time == "real" or config.vehicle.kind == "carla"
 
 
 def is_finished(directory: Path) -> bool:

@@ -1,1 +1,1 @@
-"""A vehicle in a CARLA server, through the wheel `carla`; no real server was ever used."""
+"""A vehicle in a CARLA server, through the package `carla`; no real server was ever used."""

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from statistics import median
 from typing import Final
 
+import numpy as np
 from msgspec import Struct
 
 from lavt.clock import Clock
@@ -117,17 +118,16 @@ def time_ticks(session: CarlaSession, clock: Clock, count: int = TIMED_TICKS) ->
         else:
             pictures_ms.append((clock.now().mono_ns - begin_ns) / NS_PER_MS)
     return TickTimes(
-        _percentile(ticks_ms, 0.5),
-        _percentile(ticks_ms, 0.95),
-        _percentile(pictures_ms, 0.5),
-        _percentile(pictures_ms, 0.95),
+        _percentile(ticks_ms, 50),
+        _percentile(ticks_ms, 95),
+        _percentile(pictures_ms, 50),
+        _percentile(pictures_ms, 95),
         missing,
     )
 
 
-def _percentile(values: Sequence[float], share: float) -> float:
-    ordered = sorted(values)
-    return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else math.nan
+def _percentile(values: Sequence[float], percent: float) -> float:
+    return float(np.percentile(values, percent)) if values else math.nan
 
 
 def _drive(

@@ -19,12 +19,12 @@ SUBSTEP_S: Final = 0.01
 MIN_SUBSTEPS, MAX_SUBSTEPS = 10, 16
 OTHER_CLIENT_WAIT_S: Final = 1.0
 """A synchronous world that does not tick for this long is ticked by nobody."""
-NO_OVERRIDE: Final = "vehicle.carla.host and vehicle.carla.port"
+ADDRESS_KEYS: Final = "vehicle.carla.host and vehicle.carla.port"
 
 
 _all_clients: list[Any] = []
-"""All clients of this process, which are never freed: if one of the wheel's own threads happens to free the client, the
-process is aborted."""
+"""All clients of this process, which are never freed: if a thread of the package `carla` happens to free the client,
+the process is aborted."""
 _usable_clients: dict[tuple[str, int], Any] = {}
 """The newest client of each address, which the sessions of a sweep share."""
 
@@ -65,12 +65,12 @@ def connect(carla: Any, settings: CarlaSettings) -> Any:
         forget_client(settings)
         raise UserError(
             f"no CARLA server answers at {settings.address} within {settings.timeout_s:g} s: start CARLA {SUPPORTED} "
-            f"there, or set {NO_OVERRIDE}"
+            f"there, or set {ADDRESS_KEYS}"
         ) from None
     if found != SUPPORTED:
         raise UserError(
             f"the CARLA server at {settings.address} has version {found!r}, but LAVT supports {SUPPORTED} only: start "
-            f"CARLA {SUPPORTED}, or set {NO_OVERRIDE}"
+            f"CARLA {SUPPORTED}, or set {ADDRESS_KEYS}"
         )
     return client
 
@@ -131,7 +131,7 @@ def _check_nobody_ticks(world: Any, settings: CarlaSettings) -> None:
         return
     raise UserError(
         f"another client ticks the CARLA server at {settings.address}: end it, because only one client can, or set "
-        f"{NO_OVERRIDE}"
+        f"{ADDRESS_KEYS}"
     )
 
 

@@ -1,4 +1,4 @@
-"""The only module that imports the wheel `carla`, and only when a CARLA vehicle is built."""
+"""The only module that imports the package `carla`, and only when a CARLA vehicle is built."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ def load_library() -> Any:
         installed = version("carla")
     except PackageNotFoundError:
         raise UserError(
-            f"vehicle.kind carla needs the package carla {SUPPORTED}: run `pip install 'lavt[carla]'` with Python 3.11 "
-            "or 3.12"
+            f"vehicle.kind carla needs the package carla {SUPPORTED}: pip install -e '.[carla]' in the clone, with "
+            "Python 3.11 or 3.12"
         ) from None
     if installed != SUPPORTED:
         raise UserError(
-            f"the package carla is {installed}, but LAVT supports {SUPPORTED} only: run "
-            f"`pip install carla=={SUPPORTED}`"
+            f"the package carla is {installed}, but LAVT supports {SUPPORTED} only: pip install carla=={SUPPORTED}"
         )
     import carla  # noqa: PLC0415 (an extra, and large)
 

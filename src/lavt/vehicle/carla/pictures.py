@@ -1,4 +1,4 @@
-"""The pictures that a CARLA camera has delivered, by frame; the wheel's threads fill it, the camera node empties it."""
+"""The pictures of a CARLA camera, by frame: threads of the package `carla` bring them, the camera node takes them."""
 
 from __future__ import annotations
 

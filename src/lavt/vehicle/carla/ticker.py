@@ -132,7 +132,10 @@ class Ticker:
             self._hand_brake = hand_brake
 
     def tick_until(self, to_ns: int) -> None:
-        """Make all ticks that are due by `to_ns`; do nothing if a thread makes them. Raises `VehicleError`."""
+        """Make all ticks that are due by `to_ns`; if a thread makes them, note that the actuator is alive.
+
+        Raises `VehicleError`.
+        """
         if self._is_threaded:
             self._heard_ns = to_ns
             if self._failed is not None:
