@@ -77,7 +77,7 @@ def test_without_the_wheel_one_sentence_says_what_to_install(monkeypatch: pytest
         raise PackageNotFoundError(name)
 
     monkeypatch.setattr(library, "version", no_version)
-    with pytest.raises(UserError, match=r"pip install 'lavt\[carla\]'"):
+    with pytest.raises(UserError, match=r"pip install -e '\.\[carla\]'"):
         library.load_library()
     monkeypatch.setattr(library, "version", lambda _: "0.9.15")
     with pytest.raises(UserError, match=r"is 0\.9\.15"):
