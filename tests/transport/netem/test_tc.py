@@ -12,6 +12,7 @@ from typing import Any
 from unittest.mock import MagicMock
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -30,6 +31,7 @@ from lavt.transport.emulation.impairment import (
     check_flows,
     check_netem_impairment,
 )
+from lavt.transport.netem import queue_probe
 from lavt.transport.netem.correlated_jitter import CorrelatedJitter, next_deviation
 from lavt.transport.netem.netem import NetemInterface, run_tc
 from lavt.transport.netem.queue_probe import ProbeResult, judge, measure, queue_probes, summarize
@@ -645,6 +647,12 @@ The fields of a `ProbeResult` are sent, lost, reordered, early, and the delay's 
             "191.10 ms (median)",
         ),
         (Impairment(150, loss=0.1), "video", ProbeResult(50, 50, 0, 0, None, None, None), "50 of 50 packets were lost"),
+        (
+            Impairment(150, loss=0.1, loss_burst_packets=5),
+            "video",
+            ProbeResult(50, 48, 0, 0, 150.0, 150.0, 150.0),
+            "48 of 50 packets were lost",
+        ),
     ],
 )
 def test_each_measured_difference_is_reported(
@@ -672,6 +680,7 @@ def test_each_measured_difference_is_reported(
     ("impairment", "measured"),
     [
         (Impairment(150, loss=0.1, loss_burst_packets=5), ProbeResult(10, 10, 0, 0, None, None, None)),
+        (Impairment(150, loss=0.1, loss_burst_packets=5), ProbeResult(50, 31, 0, 0, 150.0, 150.0, 150.0)),
         (Impairment(150, loss=0.5), ProbeResult(10, 9, 0, 0, None, None, None)),
         (Impairment(150, reorder=0.5), ProbeResult(10, 0, 8, 9, None, None, None)),
         (Impairment(150, 10), ProbeResult(50, 0, 0, 0, 140.0, 191.0, 195.0)),
@@ -682,6 +691,23 @@ def test_plausible_measurements_are_accepted(impairment: Impairment, measured: P
     """Plausible shares of losses and reordering, a median that jitter allows, and any median with a rate pass."""
     flow = ImpairedFlow("video", "udp", 5600, "source", impairment)
     assert judge([flow], [], {**AS_REQUESTED, "video": measured}) == []
+
+
+@pytest.mark.parametrize(("share", "burst_packets"), [(0.1, 5.0), (0.25, 1.0), (0.3, 20.0)])
+def test_count_probabilities_are_those_of_a_simulated_chain(share: float, burst_packets: float) -> None:
+    """The probability of each count agrees with its frequency in 20 000 simulated measurements of 50 packets."""
+    runs, packets, generator = 20_000, 50, np.random.default_rng(5)
+    end = 1 / burst_packets
+    begin = share * end / (1 - share) if burst_packets > 1 else share
+    end = end if burst_packets > 1 else 1 - share
+    is_lost, lost = generator.random(runs) < share, np.zeros(runs, dtype=int)
+    for _ in range(packets):
+        lost += is_lost
+        is_lost = generator.random(runs) < np.where(is_lost, 1 - end, begin)
+    probabilities = queue_probe._count_probabilities(packets, share, 1 - begin - end)
+
+    assert sum(probabilities) == pytest.approx(1)
+    assert np.bincount(lost, minlength=packets + 1) / runs == pytest.approx(np.array(probabilities), abs=0.015)
 
 
 def test_missing_interface_is_reported() -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import math
 import socket
 import struct
 from collections.abc import Mapping, Sequence
@@ -40,9 +39,8 @@ POLL_NS: Final = 10 * NS_PER_MS
 """Polling period for test packets that are still in the queue."""
 MEDIAN_TOLERANCE_MS: Final = 1.0
 """Largest accepted difference between a median and the requested delay."""
-SHARE_TOLERANCE_SIGMAS: Final = 4.0
-"""Largest accepted difference between a measured count and the count by the requested share, in standard deviations of
-the binomial distribution. A difference of one more packet is accepted, too."""
+LEAST_PROBABILITY: Final = 1e-5
+"""The requested share is in doubt if a count as low, or as high, as the measured one is less probable than this."""
 OTHER_PORT: Final = 9
 """Port of the other end of a test packet: the port of the discard service."""
 RTP_FIRST_BYTE: Final = 0x80
@@ -206,10 +204,10 @@ def _check_delays(probe: QueueProbe, result: ProbeResult | None) -> list[str]:
 def _check_counts(probe: QueueProbe, result: ProbeResult) -> list[str]:
     name, impairment = probe.name, probe.impairment
     reasons = []
-    if not _is_plausible_share(result.lost, result.sent, impairment.loss, _variance_factor(impairment)):
+    if not _is_plausible_share(result.lost, result.sent, impairment.loss, _loss_correlation(impairment)):
         reasons.append(f"{name}: {result.lost} of {result.sent} packets were lost instead of {impairment.loss:.1%}")
     arrived = result.sent - result.lost
-    if not _is_plausible_share(result.early, arrived, impairment.reorder, 1.0):
+    if not _is_plausible_share(result.early, arrived, impairment.reorder):
         reasons.append(
             f"{name}: {result.early} of {arrived} packets overtook others instead of {impairment.reorder:.1%}"
         )
@@ -218,23 +216,32 @@ def _check_counts(probe: QueueProbe, result: ProbeResult) -> list[str]:
     return reasons
 
 
-def _is_plausible_share(count: int, packets: int, share: float, variance_factor: float) -> bool:
-    """Return whether `count` of `packets` is plausible if each packet is counted with the probability `share`.
+def _is_plausible_share(count: int, packets: int, share: float, correlation: float = 0.0) -> bool:
+    """Return whether `count` of `packets` is plausible for the requested share of counted packets.
 
-    The variance is that of the binomial distribution times `variance_factor`.
+    `correlation` is that of neighbouring packets: 0 if each packet is counted independently of the others.
     """
     if share == 0:
         return count == 0
-    deviation = math.sqrt(packets * share * (1 - share) * variance_factor)
-    return abs(count - packets * share) <= SHARE_TOLERANCE_SIGMAS * deviation + 1
+    probabilities = _count_probabilities(packets, share, correlation)
+    return min(sum(probabilities[: count + 1]), sum(probabilities[count:])) >= LEAST_PROBABILITY
 
 
-def _variance_factor(impairment: Impairment) -> float:
-    """Return how much bursts increase the variance of a loss count: (1 + r) / (1 - r) for a correlation r."""
-    if not has_loss_bursts(impairment):
-        return 1.0
-    correlation = 1 - sum(burst_probabilities(impairment))
-    return (1 + correlation) / (1 - correlation)
+def _count_probabilities(packets: int, share: float, correlation: float) -> list[float]:
+    """Return the probabilities that 0, 1, ... `packets` are counted, for a stationary Markov chain of two states."""
+    begin, end = share * (1 - correlation), (1 - share) * (1 - correlation)
+    # The probabilities of each count, if the next packet is passed over, and if it is counted.
+    passed, counted = [1 - share], [share]
+    for _ in range(packets):
+        pairs = list(zip([*passed, 0.0], [0.0, *counted], strict=True))
+        passed = [(1 - begin) * p + end * c for p, c in pairs]
+        counted = [begin * p + (1 - end) * c for p, c in pairs]
+    return [p + c for p, c in zip(passed, counted, strict=True)]
+
+
+def _loss_correlation(impairment: Impairment) -> float:
+    """Return the correlation of the losses of neighbouring packets."""
+    return 1 - sum(burst_probabilities(impairment)) if has_loss_bursts(impairment) else 0.0
 
 
 class _CapturedPackets:
