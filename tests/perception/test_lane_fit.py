@@ -8,10 +8,10 @@ from lavt.perception.lane_fit import (
     Sides,
     fit_lane,
     mark_points,
-    sides_by_windows,
     sides_near,
-    start_centre,
 )
+from lavt.perception.lane_paint import Mask
+from lavt.perception.lane_search import StartLane, has_parallel, sides_by_windows, start_lanes
 from lavt.streams import stream
 
 GRID = GroundGrid()
@@ -33,10 +33,23 @@ def points_on_parallels(
     )
 
 
+def mask_of(points: Points) -> Mask:
+    """Return the mask whose painted cells contain the points on the grid."""
+    mask = np.zeros((GRID.rows, GRID.columns), dtype=np.uint8)
+    row = np.rint((GRID.far_m - points.x_m) / GRID.step_x_m - 0.5).astype(int)
+    column = np.rint((GRID.half_width_m - points.y_m) / GRID.step_y_m - 0.5).astype(int)
+    inside = (row >= 0) & (row < GRID.rows) & (column >= 0) & (column < GRID.columns)
+    mask[row[inside], column[inside]] = 255
+    return mask
+
+
+def lanes_of(points: Points, count: int = 1, width_m: float = 3.5) -> list[StartLane]:
+    return start_lanes(mask_of(points), GRID, width_m, count)
+
+
 def search_and_fit(points: Points, width_m: float = 3.5) -> tuple[Sides, LaneFit | None]:
-    start = start_centre(points, GRID, width_m)
-    assert start is not None
-    sides, _ = sides_by_windows(points, GRID, start, width_m)
+    (start,) = lanes_of(points)
+    sides, _ = sides_by_windows(points, GRID, start.centre, start.width_m)
     return sides, fit_lane(points, sides, GRID, width_m)
 
 
@@ -122,7 +135,7 @@ def test_a_patch_beside_the_line_does_not_bend_the_fit() -> None:
 def test_too_few_points_are_no_lane() -> None:
     """No points, or a handful of points, have no fit and raise no error."""
     nothing = Points(np.empty(0), np.empty(0))
-    assert start_centre(nothing, GRID, 3.5) is None
+    assert lanes_of(nothing) == []
     assert fit_lane(nothing, np.empty(0, dtype=np.int8), GRID, 3.5) is None
     few = points_on_parallels((0.0, 0.0, 0.0), (1.75, -1.75), np.arange(5.0, 5.5, 0.1))
     assert fit_lane(few, sides_near(few, (0.0, 0.0, 0.0), 3.5), GRID, 3.5) is None
@@ -134,3 +147,52 @@ def test_speckle_has_little_confidence() -> None:
     points = Points(generator.uniform(3.6, 20, 3000), generator.uniform(-7, 7, 3000))
     fit = fit_lane(points, sides_near(points, (0.0, 0.0, 0.0), 3.5), GRID, 3.5)
     assert fit is None or fit.confidence < 0.1
+
+
+def test_a_solid_wall_does_not_hide_two_broken_lines() -> None:
+    """Two broken lines a lane's width apart are among the candidates, although a wall beside them has more paint."""
+    dashes_m = np.concatenate([np.arange(4.0, 7.0, 0.1), np.arange(13.0, 16.0, 0.1)])
+    lines = points_on_parallels((0.2, 0.0, 0.0), (1.75, -1.75), dashes_m)
+    wall = points_on_parallels((0.2, 0.0, 0.0), (3.0,))
+    points = Points(np.concatenate([lines.x_m, wall.x_m]), np.concatenate([lines.y_m, wall.y_m]))
+    assert any(abs(start.centre[0] - 0.2) < 0.1 and abs(start.width_m - 3.5) < 0.3 for start in lanes_of(points, 3))
+    assert not any(abs(start.centre[0] - 0.2) < 0.1 for start in lanes_of(points, 1)), "the wall wins"
+
+
+def test_candidates_are_different_lanes_around_the_car() -> None:
+    """With three lines, the candidates differ, each has the car in it, and one of them has each spacing."""
+    points = points_on_parallels((0.0, 0.0, 0.0), (2.0, -1.2, -2.2))
+    starts = lanes_of(points, count=3)
+    assert len(starts) == 3
+    assert all(abs(start.centre[0]) <= start.width_m / 2 + 0.25 for start in starts)
+    assert {round(start.centre[0], 1) for start in starts} >= {0.4, -0.1}
+
+
+@pytest.mark.parametrize(("width_m", "expected_m"), [(4.2, 3.5), (3.0, 3.5), (2.7, 2.7)])
+def test_a_lane_of_another_width_is_found(width_m: float, expected_m: float) -> None:
+    """A lane that is wider or narrower than expected is the first candidate, with about its own width."""
+    points = points_on_parallels((0.0, 0.0, 0.0), (width_m / 2, -width_m / 2))
+    (start,) = lanes_of(points, width_m=expected_m)
+    assert start.width_m == pytest.approx(width_m, abs=0.21)
+
+
+def test_a_scattered_line_is_visible_but_not_clear() -> None:
+    """A ragged edge, such as that of a reflection, is visible like a line, but has little clearness."""
+    clean = points_on_parallels((0.0, 0.0, 0.0), (1.75, -1.75))
+    generator = stream(1, "ragged")
+    ragged = Points(clean.x_m, clean.y_m + generator.normal(0.0, 0.11, len(clean.y_m)))
+    fits = [fit_lane(points, sides_near(points, (0, 0, 0), 3.5), GRID, 3.5) for points in (clean, ragged)]
+    assert fits[0] is not None
+    assert fits[1] is not None
+    assert fits[0].clearness > 0.9
+    assert fits[1].confidence > 0.9
+    assert fits[1].clearness < 0.7 * fits[1].confidence
+
+
+def test_a_parallel_is_a_line_of_this_lane_or_of_the_next() -> None:
+    """Two lines of the lane are parallels, one line and the next lane's are, too, but one line alone is not."""
+    for offsets_m, expected in (((1.75, -1.75), True), ((1.75, 5.25), True), ((1.75,), False)):
+        points = points_on_parallels((0.0, 0.0, 0.0), offsets_m)
+        fit = fit_lane(points, sides_near(points, (0, 0, 0), 3.5), GRID, 3.5)
+        assert fit is not None
+        assert has_parallel(points, fit, GRID) is expected

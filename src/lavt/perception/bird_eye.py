@@ -19,13 +19,11 @@ from lavt.perception.calibration import CalibratedCamera, ground_to_picture, pic
 STAMP_SIDE_PX = 64
 """Side of the top left square with the time stamp, which is masked if the pictures are stamped."""
 STAMP_MARGIN_PX = 12
-"""Width of the masked margin beside the stamp at a focal length of up to 320 px. The stamp's edges affect pixels up to
-this far away (half of `MARK_PX`)."""
+"""Width of the masked margin beside the stamp at a focal length of up to 320 px: the codec smears the stamp's edges."""
 DistortionMaps = tuple[NDArray[np.int16], NDArray[np.uint16]]
 """OpenCV's fixed-point maps, whole parts and fractions: for each cell its coordinates in the cropped rows."""
 ROW_MARGIN_PX = 3
-"""Additional rows of pixels above and below the grid, and below the stamp. Interpolation and smoothing over 5 rows use
-them."""
+"""Additional rows of pixels above and below the grid, and below the stamp, for interpolation and the codec's smear."""
 CENTRAL_HALF_WIDTH_M = 3.5
 """Half the width of the central strip of ground, which a camera must see."""
 MIN_VISIBLE_SHARE = 0.4
@@ -92,7 +90,7 @@ class BirdEye:
         return picture[self.top_px : self.bottom_px]
 
     def view_from_above(self, region: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Map cropped rows to the grid, (grid.rows, grid.columns); cells outside the picture are black."""
+        """Map cropped rows, with any number of channels, to the grid's cells; cells outside the picture are black."""
         size = (self.grid.columns, self.grid.rows)
         if isinstance(self.region_from_grid, tuple):
             visible = cv2.remap(region, *self.region_from_grid, cv2.INTER_LINEAR)

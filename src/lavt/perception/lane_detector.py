@@ -11,19 +11,9 @@ from msgspec.structs import replace
 from lavt.domain import NS_PER_MS, CameraModel, Lane, Picture, SeenLane
 from lavt.perception.bird_eye import GroundGrid, make_bird_eye
 from lavt.perception.calibration import CalibratedCamera, calibrated_pinhole_camera
-from lavt.perception.lane_fit import (
-    OUTLIER_M,
-    LaneFit,
-    Points,
-    Sides,
-    fit_lane,
-    has_parallel,
-    mark_points,
-    sides_by_windows,
-    sides_near,
-    start_centre,
-)
-from lavt.perception.lane_pixels import Mask, lane_pixels
+from lavt.perception.lane_fit import OUTLIER_M, LaneFit, Points, Sides, fit_lane, mark_points, sides_near
+from lavt.perception.lane_paint import Mask, lane_paint
+from lavt.perception.lane_search import has_parallel, sides_by_windows, start_lanes
 
 SMOOTHING = 0.6
 """Weight of the newest picture in the moving average; `lavt.experiment.boundary.delay_margin` depends on it."""
@@ -33,6 +23,12 @@ LANE_WIDTH_M = 3.5
 """The lane's width until it has been measured."""
 TRACK_CONFIDENCE = 0.2
 """A lane with less confidence is not tracked. One line that is visible over 40 % of the length gives 0.2."""
+MIN_CLEARNESS = 0.35
+"""A search finds no lane with less clearness (`LaneFit.clearness`): there is no earlier picture that supports it."""
+START_LANES = 3
+"""How many candidates a search fits."""
+CLEAR_ENOUGH = 0.7
+"""A search ends at a lane with this clearness, and does not try the other candidates."""
 REFINEMENTS = 2
 """How often a lane that a search found is fitted again: each fit brings the curve nearer to the far paint, so that the
 next fit uses more of this paint."""
@@ -55,12 +51,12 @@ class DetectionTrace:
     """The results of all steps of lane detection in one picture, for inspection."""
 
     mask: Mask
-    """The marks in the bird's-eye view, (grid.rows, grid.columns)."""
+    """The paint in the bird's-eye view, (grid.rows, grid.columns)."""
     points: Points
     sides: Sides
     expected: tuple[float, float, float] | None
-    """The centre near which the lines were looked for: of the previous lane, or in a search the first guess of
-    `start_centre`; None if it found no paint."""
+    """The centre near which the lines were looked for: of the previous lane, or in a search the first candidate of
+    `start_lanes`; None if it found no paint."""
     expected_width_m: float
     windows: tuple[tuple[float, float], ...]
     """The sliding windows of a search, as `sides_by_windows` returns them; empty if the lane was tracked."""
@@ -87,7 +83,6 @@ class LaneDetector:
     ) -> None:
         calibration = calibrated_pinhole_camera(camera) if isinstance(camera, CameraModel) else camera
         self._shape = (calibration.height_px, calibration.width_px, 3)
-        self._scale = calibration.scale
         self.bird_eye = make_bird_eye(calibration, grid, stamped=stamped)
         self.trace: DetectionTrace | None = None
         self._lane_width_m = lane_width_m
@@ -102,7 +97,8 @@ class LaneDetector:
         """Return the lane in the next picture; raise `ValueError` unless its shape is the camera's, (h, w, 3)."""
         if picture_bgr.shape != self._shape:
             raise ValueError(f"the picture has the shape {picture_bgr.shape}, not {self._shape}")
-        mask = self.bird_eye.view_from_above(lane_pixels(self.bird_eye.region(picture_bgr), self._scale))
+        view = self.bird_eye.view_from_above(self.bird_eye.region(picture_bgr))
+        mask = lane_paint(view, self.bird_eye.grid)
         points = mark_points(mask, self.bird_eye.grid)
         tracked = self._misses < FORGET_AFTER_PICTURES
         self.trace = self._track(mask, points) if tracked else self._search(mask, points)
@@ -124,21 +120,27 @@ class LaneDetector:
 
     def _search(self, mask: Mask, points: Points) -> DetectionTrace:
         grid = self.bird_eye.grid
-        start = start_centre(points, grid, self._lane_width_m)
-        if start is None:
+        starts = start_lanes(mask, grid, self._lane_width_m, START_LANES)
+        if not starts:
             return DetectionTrace(
                 mask, points, np.zeros(len(points.x_m), dtype=np.int8), None, self._lane_width_m, (), None
             )
-        sides, windows = sides_by_windows(points, grid, start, self._lane_width_m)
-        # The windows follow any curve, also a line that leads away from the lane. The first guess is rough, but uses
-        # all paint. So both are fitted, and the fit with more confidence wins.
-        fits = (
-            self._refine(points, fit_lane(points, sides, grid, self._lane_width_m)),
-            self._refine(points, self._fit_near(points, start, self._lane_width_m)),
-        )
-        lanes = [fit for fit in fits if fit is not None and has_parallel(points, fit, grid) and contains_car(fit)]
-        found = max(lanes, key=lambda fit: fit.confidence, default=None)
-        return DetectionTrace(mask, points, sides, start, self._lane_width_m, windows, found)
+        # A candidate is rough, but uses all paint. Windows follow any curve, also a line that leads away from the lane.
+        # So the candidates and the windows along the first one are fitted, until a lane is clear enough.
+        first, width_m = starts[0]
+        sides, windows = sides_by_windows(points, grid, first, width_m)
+        found = None
+        for start in (starts[0], None, *starts[1:]):
+            rough = fit_lane(points, sides, grid, width_m) if start is None else self._fit_near(points, *start)
+            fit = self._refine(points, rough)
+            if fit is not None and self._is_believed(points, fit):
+                found = max(found or fit, fit, key=lambda lane: lane.clearness)
+                if found.clearness >= CLEAR_ENOUGH:
+                    break
+        return DetectionTrace(mask, points, sides, first, width_m, windows, found)
+
+    def _is_believed(self, points: Points, fit: LaneFit) -> bool:
+        return fit.clearness >= MIN_CLEARNESS and contains_car(fit) and has_parallel(points, fit, self.bird_eye.grid)
 
     def _fit_near(self, points: Points, centre: tuple[float, float, float], width_m: float) -> LaneFit | None:
         return fit_lane(points, sides_near(points, centre, width_m), self.bird_eye.grid, width_m, centre)

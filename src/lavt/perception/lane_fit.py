@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from lavt.domain import FloatArray
 from lavt.perception.bird_eye import GroundGrid
-from lavt.perception.lane_pixels import Mask
+from lavt.perception.lane_paint import Mask
 
 Sides = NDArray[np.int8]
 """For each point +1: left line, -1: right line, 0: neither."""
@@ -43,18 +43,6 @@ MAX_SLOPE = 0.5
 """Largest slope of the lane relative to the car: a steeper line crosses the lane."""
 MAX_CURVATURE_PER_M = 1 / 15
 """Largest curvature of a lane: a car at walking pace could just follow it."""
-COLUMN_BIN_M = 0.1
-"""Width of the bins in which `start_centre` counts paint."""
-START_LENGTH_M = 12.0
-"""Length of the paint that `start_centre` uses: more than one period of broken marks."""
-START_SLOPES = (0.0, 0.05, -0.05, 0.1, -0.1, 0.15, -0.15, 0.2, -0.2, 0.25, -0.25)
-"""Slopes that `start_centre` tries. Straight ahead is the first, so that it wins a tie."""
-START_BENDS_PER_M = (0.0, 0.006, -0.006, 0.012, -0.012)
-"""Values of c2, which is half the curvature, that `start_centre` tries: down to a radius of 42 m."""
-WINDOW_M = (1.0, 0.6)
-"""Length of a sliding window along x, and half its width."""
-MIN_WINDOW_POINTS = 6
-"""A window with fewer points measures no offset."""
 COVER_BIN_M = 0.5
 """Length of the bins in which the visible share of a line is counted."""
 MIN_COVER_POINTS = 4
@@ -63,12 +51,13 @@ COVER_LINE_M = 0.15
 """Paint this near is on the line: half the width of a mark, plus slightly more for the error of the curve."""
 MIN_CLEAN_SHARE = 0.6
 """Minimum share of the paint in the corridor (`CORRIDOR_M`) that is on the line. By chance it would be 0.2."""
+SHARP_SPREAD_M = (0.08, 0.144)
+"""A line is sharp, or not at all, if its paint has this root mean square distance from it. A mark of 0.15 m has 0.04 m,
+a double line 0.12 m, and paint at random within `OUTLIER_M` 0.144 m."""
 COVER_BINS_TOGETHER = 2
 """Number of adjacent bins that must show paint: paint shorter than a metre is a spot."""
 COVER_REACH_M = 3.0
 """Half the gap of broken marks: paint makes this much of the line before and behind it visible."""
-MIN_PARALLEL_VISIBLE = 0.2
-"""Visible share that a parallel needs to be the line of a neighbouring lane."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +81,25 @@ class LaneFit:
     right_visible: float
     on_line_share: float
     """Share of the paint in and beside the lane that is on its lines, 0 to 1."""
+    left_clear: float
+    """Share of the grid's length over which the left line is visible without other paint beside it, times its
+    sharpness, 0 to 1."""
+    right_clear: float
+
+    @property
+    def clearness(self) -> float:
+        """The confidence by stricter rules, which a search needs: by the clear shares instead of the visible ones."""
+        return (self.left_clear + self.right_clear) / 2 * self._fitting
 
     @property
     def confidence(self) -> float:
         """The mean visible share of the two lines, times the share of paint on the lines in excess of chance."""
+        return (self.left_visible + self.right_visible) / 2 * self._fitting
+
+    @property
+    def _fitting(self) -> float:
         by_chance = 4 * OUTLIER_M / (self.width_m + 2 * CORRIDOR_M)
-        return (self.left_visible + self.right_visible) / 2 * max(self.on_line_share - by_chance, 0.0) / (1 - by_chance)
+        return max(self.on_line_share - by_chance, 0.0) / (1 - by_chance)
 
 
 def mark_points(mask: Mask, grid: GroundGrid) -> Points:
@@ -109,66 +111,11 @@ def mark_points(mask: Mask, grid: GroundGrid) -> Points:
 
 def sides_near(points: Points, centre: tuple[float, float, float], width_m: float) -> Sides:
     """Assign each point that is near a line of a known lane to that line."""
-    middle, slope_factor = _evaluate_centre(points.x_m, centre)
+    middle, slope_factor = evaluate_centre(points.x_m, centre)
     offset = points.y_m - middle
     line = width_m / 2 * slope_factor
     sides = np.where(offset > 0, 1, -1)
     return np.where(np.abs(np.abs(offset) - line) < CORRIDOR_M, sides, 0).astype(np.int8)
-
-
-def start_centre(points: Points, grid: GroundGrid, width_m: float) -> tuple[float, float, float] | None:
-    """Estimate the centre c0, c1, c2 of the lane that contains the car; None without paint.
-
-    For several slopes and bends the paint is straightened and counted along y modulo the lane's width. The lines of the
-    lane and of its neighbours then coincide; the slope and bend with the highest peak win. Lanes repeat every
-    `width_m`, so exactly one of them has its centre at most half a width from the car.
-    """
-    near = points.x_m < grid.near_m + START_LENGTH_M
-    bins = round(width_m / COLUMN_BIN_M)
-    x, y = points.x_m[near], points.y_m[near]
-    far_m = grid.near_m + START_LENGTH_M
-    spread_m = float(np.abs(y).max(initial=0.0)) + (max(START_SLOPES) + max(START_BENDS_PER_M) * far_m) * far_m
-    lanes = 2 * math.ceil(spread_m / width_m)  # enough for all straightened paint, half of them on the right
-    y_bins, bins_per_m = y / width_m * bins + lanes // 2 * bins, bins / width_m
-    best_score, best = MIN_WINDOW_POINTS, None
-    for bend in START_BENDS_PER_M:
-        for slope in START_SLOPES:
-            straight = (y_bins - (slope * bins_per_m + bend * bins_per_m * x) * x).astype(np.intp)
-            counts = np.bincount(straight, minlength=lanes * bins).reshape(-1, bins).sum(axis=0)
-            scores = counts + np.roll(counts, 1) + np.roll(counts, -1)
-            if scores.max() > best_score:
-                line_m = (float(np.argmax(scores)) + 0.5) / bins * width_m  # one of the lines, between 0 and the width
-                best_score, best = int(scores.max()), (line_m - width_m / 2, slope, bend)
-    return best
-
-
-def sides_by_windows(
-    points: Points, grid: GroundGrid, start: tuple[float, float, float], width_m: float
-) -> tuple[Sides, tuple[tuple[float, float], ...]]:
-    """Follow both lines from the near end with a pair of sliding windows that move together.
-
-    The windows follow the centre `start`, shifted by the last measured offset. Returns the sides and, for each
-    position of the pair, its near end (x) and the offset of its middle to the left of `start`, in metres.
-    """
-    length_m, half_width_m = WINDOW_M
-    start_y_m, _ = _evaluate_centre(points.x_m, start)
-    offset_m = points.y_m - start_y_m
-    middle_m = 0.0
-    sides = np.zeros(len(points.x_m), dtype=np.int8)
-    windows = []
-    for low_m in np.arange(grid.near_m, grid.far_m, length_m):
-        inside = (points.x_m >= low_m) & (points.x_m < low_m + length_m)
-        measured_offsets_m = []
-        windows.append((float(low_m), middle_m))
-        for side in (1, -1):
-            line_m = middle_m + side * width_m / 2
-            in_window = inside & (np.abs(offset_m - line_m) < half_width_m)
-            sides[in_window] = side
-            if np.count_nonzero(in_window) >= MIN_WINDOW_POINTS:
-                measured_offsets_m.append(float(np.mean(offset_m[in_window])) - line_m)
-        if measured_offsets_m:
-            middle_m += sum(measured_offsets_m) / len(measured_offsets_m)
-    return sides, tuple(windows)
 
 
 def fit_lane(
@@ -202,51 +149,40 @@ def fit_lane(
     _, c1, c2 = centre
     if abs(c1) > MAX_SLOPE or 2 * abs(c2) > MAX_CURVATURE_PER_M:
         return None
-    offset_m = _lateral_offset_m(points, centre)
+    offset_m = lateral_offset_m(points, centre)
     outside_m = np.abs(offset_m) - fitted_width_m / 2  # distance beyond the nearer line; negative inside the lane
     line_distance_m = np.abs(outside_m)
+    left_visible, left_clear = line_shares(points.x_m[offset_m > 0], line_distance_m[offset_m > 0], grid)
+    right_visible, right_clear = line_shares(points.x_m[offset_m < 0], line_distance_m[offset_m < 0], grid)
     return LaneFit(
         centre=centre,
         width_m=fitted_width_m,
         near_m=float(kept.x_m.min()),
         far_m=float(kept.x_m.max()),
-        left_visible=_visible_share(points.x_m[offset_m > 0], line_distance_m[offset_m > 0], grid),
-        right_visible=_visible_share(points.x_m[offset_m < 0], line_distance_m[offset_m < 0], grid),
+        left_visible=left_visible,
+        right_visible=right_visible,
+        left_clear=left_clear,
+        right_clear=right_clear,
         on_line_share=float(np.count_nonzero(line_distance_m < OUTLIER_M))
         / max(int(np.count_nonzero(outside_m < CORRIDOR_M)), 1),
     )
 
 
-def has_parallel(points: Points, fit: LaneFit, grid: GroundGrid) -> bool:
-    """Return whether two lines a lane's width apart are visible.
-
-    They are both lines of this lane, or one of them and the next line on the other side of it.
-    """
-    visible_sides = [
-        side for side, share in ((1, fit.left_visible), (-1, fit.right_visible)) if share >= MIN_PARALLEL_VISIBLE
-    ]
-    if len(visible_sides) != 1:
-        return len(visible_sides) == 2
-    (side,) = visible_sides
-    distance_m = np.abs(_lateral_offset_m(points, fit.centre) - side * 1.5 * fit.width_m)
-    return _visible_share(points.x_m, distance_m, grid) >= MIN_PARALLEL_VISIBLE
-
-
-def _evaluate_centre(x_m: FloatArray, centre: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
+def evaluate_centre(x_m: FloatArray, centre: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
     """Return y of a centre at x, and the distance to a parallel along y divided by the perpendicular distance."""
     c0, c1, c2 = centre
     slope = c1 + 2 * c2 * x_m
     return c0 + (c1 + c2 * x_m) * x_m, np.sqrt(1 + slope * slope)
 
 
-def _lateral_offset_m(points: Points, centre: tuple[float, float, float]) -> FloatArray:
+def lateral_offset_m(points: Points, centre: tuple[float, float, float]) -> FloatArray:
     """Return the offsets of points to the left of a centre."""
-    middle, slope_factor = _evaluate_centre(points.x_m, centre)
+    middle, slope_factor = evaluate_centre(points.x_m, centre)
     return (points.y_m - middle) / slope_factor
 
 
 def _residual_m(points: Points, side: Sides, centre: tuple[float, float, float], width_m: float) -> FloatArray:
-    return _lateral_offset_m(points, centre) - side * width_m / 2
+    return lateral_offset_m(points, centre) - side * width_m / 2
 
 
 class _CentreFit(NamedTuple):
@@ -269,7 +205,7 @@ def _fit_once(
     if max(left, right) < MIN_LINE_POINTS:
         return None
     x, y = points.x_m, points.y_m
-    _, slope_factor = _evaluate_centre(x, slope_centre)
+    _, slope_factor = evaluate_centre(x, slope_centre)
     half_lane = side * slope_factor / 2
     curve = [np.ones_like(x), x]
     if float(np.ptp(x)) >= LINEAR_BELOW_M:
@@ -305,11 +241,12 @@ def _centre(coefficients: Sequence[float]) -> tuple[float, float, float]:
     return c0, c1, c2[0] if c2 else 0.0
 
 
-def _visible_share(x_m: FloatArray, distance_m: FloatArray, grid: GroundGrid) -> float:
-    """Return the share of the grid's length on which a line is visible; gaps of broken marks are visible, too.
+def line_shares(x_m: FloatArray, distance_m: FloatArray, grid: GroundGrid) -> tuple[float, float]:
+    """Return the shares of the grid's length on which a line is visible and clear; gaps of broken marks are, too.
 
     `distance_m` are the points' distances from the line. Only clean paint makes a line visible: paint where most points
-    near the line are on it.
+    near the line are on it. A line is not clear where other paint is beside it, and less clear as a whole the wider
+    its paint is spread, after points at random have been subtracted.
     """
     bins = round((grid.far_m - grid.near_m) / COVER_BIN_M)
     bin_of_point = np.minimum(((x_m - grid.near_m) / COVER_BIN_M).astype(np.int64), bins - 1)
@@ -323,4 +260,19 @@ def _visible_share(x_m: FloatArray, distance_m: FloatArray, grid: GroundGrid) ->
     visibility_steps = np.zeros(bins + 1)
     np.add.at(visibility_steps, np.maximum(ends - COVER_BINS_TOGETHER + 1 - reach, 0), 1)
     np.add.at(visibility_steps, np.minimum(ends + reach + 1, bins), -1)
-    return float(np.mean(np.cumsum(visibility_steps)[:bins] > 0))
+    visible = np.cumsum(visibility_steps)[:bins] > 0
+    has_other_paint = (beside >= MIN_COVER_POINTS) & ~clean
+    return float(np.mean(visible)), float(np.mean(visible & ~has_other_paint)) * _sharpness(distance_m)
+
+
+def _sharpness(distance_m: FloatArray) -> float:
+    """Return how sharp a line is, 0 to 1, from the points' distances from it."""
+    on_line_m = distance_m[distance_m < OUTLIER_M]
+    others = np.count_nonzero(distance_m < CORRIDOR_M) - len(on_line_m)
+    random_per_m = others / (CORRIDOR_M - OUTLIER_M)
+    count = len(on_line_m) - random_per_m * OUTLIER_M
+    if count < MIN_COVER_POINTS:
+        return 0.0
+    square_m2 = max(float(on_line_m @ on_line_m) - random_per_m * OUTLIER_M**3 / 3, 0.0) / count
+    sharp_m, blurred_m = SHARP_SPREAD_M
+    return min(max((blurred_m - math.sqrt(square_m2)) / (blurred_m - sharp_m), 0.0), 1.0)

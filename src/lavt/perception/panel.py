@@ -12,8 +12,9 @@ from lavt.domain import FloatArray, Lane, Picture
 from lavt.perception.bird_eye import BirdEye, GroundGrid
 from lavt.perception.calibration import CalibratedCamera, ground_to_picture, picture_points
 from lavt.perception.lane_detector import TRACK_CONFIDENCE, DetectionTrace, LaneDetector
-from lavt.perception.lane_fit import CORRIDOR_M, WINDOW_M
-from lavt.perception.lane_pixels import edge_pixels, grey_of, lane_pixels, white_pixels, yellow_pixels
+from lavt.perception.lane_fit import CORRIDOR_M
+from lavt.perception.lane_paint import brightness_of, white_paint, yellow_paint, yellowness_of
+from lavt.perception.lane_search import WINDOW_M
 
 TILE_PX = (400, 300)
 """Width and height of a step's tile, below a line of text."""
@@ -29,20 +30,16 @@ def draw_panel(camera: CalibratedCamera, detector: LaneDetector, picture: Pictur
     trace, bird_eye = detector.trace, detector.bird_eye
     if trace is None:
         raise ValueError("a detector has a trace after detecting")
-    region = bird_eye.region(picture)
-    grey, scale = grey_of(region), camera.scale
-    masks = {
-        "3 white: brighter than surroundings": white_pixels(grey, scale),
-        "4 yellow: much more red than blue": yellow_pixels(region),
-        "5 near vertical edges": edge_pixels(grey, scale),
-        "6 marks: (3 or 4) and 5": lane_pixels(region, scale),
-    }
+    view = bird_eye.view_from_above(bird_eye.region(picture))
     tiles = {
         "1 picture": picture,
         "2 undistorted, with the searched ground": _draw_ground_outline(camera, picture, bird_eye.grid),
-        **{label: _mask_in_picture(mask, picture, bird_eye) for label, mask in masks.items()},
-        "7 bird's-eye view, far end at the top": bird_eye.view_from_above(region),
-        "8 marks in the bird's-eye view": _grey_to_colour(trace.mask),
+        "3 bird's-eye view, far end at the top": view,
+        "4 brightness": _grey_to_colour(brightness_of(view)),
+        "5 white: brighter than both sides": _grey_to_colour(white_paint(view, bird_eye.grid)),
+        "6 yellowness": _grey_to_colour(yellowness_of(view)),
+        "7 yellow: yellower than both sides": _grey_to_colour(yellow_paint(view, bird_eye.grid)),
+        "8 paint: 5 or 7, without specks": _grey_to_colour(trace.mask),
         "9 points: left, right, other": _draw_points(trace, bird_eye.grid),
         "10 fitted lane": _draw_fit(trace, lane, bird_eye),
         "11 lane in the picture": draw_lane(camera, picture, lane),
@@ -68,13 +65,6 @@ def _make_tile(label: str, tile: Picture) -> Picture:
 
 def _grey_to_colour(grey: Picture) -> Picture:
     return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-
-
-def _mask_in_picture(mask: Picture, picture: Picture, bird_eye: BirdEye) -> Picture:
-    """Return a mask of the cropped rows at their place in the picture."""
-    whole = np.full_like(picture, 30)
-    bird_eye.region(whole)[:] = mask[..., None]
-    return whole
 
 
 def _draw_ground_outline(camera: CalibratedCamera, picture: Picture, grid: GroundGrid) -> Picture:
@@ -181,7 +171,7 @@ def _confidence_text(trace: DetectionTrace, lane: Lane) -> Picture:
     searched = trace.windows or trace.expected is None
     lines.append("searched with windows" if searched else "tracked from the last picture")
     if trace.fit is None:
-        lines.append("no two parallel lines, or an impossible lane")
+        lines.append("no two clear parallel lines, or an impossible lane")
     else:
         fit = trace.fit
         lines += [
