@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.detector_cost import compare
 from benchmarks.fleet_parts.costs import costs_per_vehicle
 from benchmarks.growth_onset import table_row
 from benchmarks.interval_coverage import percentile_bootstrap, studentised_bootstrap
 from benchmarks.virtual_loop import with_rest
 
-from lavt.errors import WorkError
+from lavt.errors import UserError, WorkError
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 VIRTUAL_LOOP = BENCHMARKS / "virtual_loop.py"
@@ -162,3 +163,13 @@ def test_the_bootstraps_of_the_coverage_study() -> None:
         assert low < 2.0 < high
     narrow, wide = percentile_bootstrap(values, generator), studentised_bootstrap(values, generator)
     assert wide[1] - wide[0] > narrow[1] - narrow[0]
+
+
+def test_detector_costs_are_compared_in_turn(tmp_path: Path) -> None:
+    """`benchmarks/detector_cost.py` gives a time of searching and of following for each version, picture and round."""
+    source = BENCHMARKS.parent / "src"
+    times_ms = compare((source, source), [np.zeros((480, 640, 3), dtype=np.uint8)] * 2, rounds=2)
+    assert times_ms.shape == (2, 2, 4)
+    assert (times_ms > 0).all()
+    with pytest.raises(UserError, match="no package lavt"):
+        compare((source, tmp_path), [], rounds=1)

@@ -127,7 +127,11 @@ def test_a_client_uses_a_calibrated_camera(show: Show) -> None:  # noqa: ARG001 
     assert isinstance(nodes.driver, DriverNode)
     detector = nodes.driver._detector
     assert isinstance(detector, LaneDetector)
-    assert isinstance(detector.bird_eye.region_from_grid, tuple)
+    expected = LaneDetector(camera_of_file(Path("camera.yaml")))
+    assert np.array_equal(detector.bird_eye.region_from_grid[0], expected.bird_eye.region_from_grid[0])
+    assert not np.array_equal(
+        detector.bird_eye.region_from_grid[0], LaneDetector(CameraModel()).bird_eye.region_from_grid[0]
+    )
 
 
 @pytest.mark.parametrize(

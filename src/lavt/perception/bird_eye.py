@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from lavt.domain import FloatArray
 from lavt.errors import UserError
-from lavt.perception.calibration import CalibratedCamera, ground_to_picture, picture_points
+from lavt.perception.calibration import CalibratedCamera, picture_points
 
 STAMP_SIDE_PX = 64
 """Side of the top left square with the time stamp, which is masked if the pictures are stamped."""
 STAMP_MARGIN_PX = 12
 """Width of the masked margin beside the stamp at a focal length of up to 320 px: the codec smears the stamp's edges."""
-DistortionMaps = tuple[NDArray[np.int16], NDArray[np.uint16]]
+PictureMaps = tuple[NDArray[np.int16], NDArray[np.uint16]]
 """OpenCV's fixed-point maps, whole parts and fractions: for each cell its coordinates in the cropped rows."""
 ROW_MARGIN_PX = 3
 """Additional rows of pixels above and below the grid, and below the stamp, for interpolation and the codec's smear."""
@@ -80,8 +80,7 @@ class BirdEye:
     grid: GroundGrid
     top_px: int
     bottom_px: int
-    region_from_grid: FloatArray | DistortionMaps
-    """From the grid to the cropped rows: a homography, or maps for a lens with distortion."""
+    region_from_grid: PictureMaps
     unstamped_mask: NDArray[np.uint8] | None
     """255 for cells that the time stamp does not cover, 0 for cells that it covers; None if it covers no cell."""
 
@@ -91,12 +90,7 @@ class BirdEye:
 
     def view_from_above(self, region: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Map cropped rows, with any number of channels, to the grid's cells; cells outside the picture are black."""
-        size = (self.grid.columns, self.grid.rows)
-        if isinstance(self.region_from_grid, tuple):
-            visible = cv2.remap(region, *self.region_from_grid, cv2.INTER_LINEAR)
-        else:
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            visible = cv2.warpPerspective(region, self.region_from_grid, size, flags=flags)
+        visible = cv2.remap(region, *self.region_from_grid, cv2.INTER_LINEAR)
         if self.unstamped_mask is not None:
             visible = cv2.bitwise_and(visible, visible, mask=self.unstamped_mask)
         return np.asarray(visible, dtype=np.uint8)
@@ -123,10 +117,6 @@ def make_bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool =
     top_px = max(math.floor(v_px[inside].min()) - ROW_MARGIN_PX, 0)
     bottom_px = min(math.ceil(v_px[inside].max()) + ROW_MARGIN_PX, camera.height_px)
     unstamped_mask = np.where(stamp, 0, 255).astype(np.uint8) if stamp.any() else None
-    if not camera.distortion:
-        shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -top_px], [0.0, 0.0, 1.0]])
-        homography = shift @ ground_to_picture(camera) @ grid.cell_to_ground()
-        return BirdEye(grid, top_px, bottom_px, homography, unstamped_mask)
     maps = np.where(inside[..., None], pixels - (0, top_px), -9.0).astype(np.float32)  # -9: outside the picture
     whole, fractions = cv2.convertMaps(maps[..., 0], maps[..., 1], cv2.CV_16SC2)
     return BirdEye(grid, top_px, bottom_px, (np.asarray(whole), np.asarray(fractions)), unstamped_mask)

@@ -8,7 +8,6 @@ is therefore linear.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -58,6 +57,10 @@ COVER_BINS_TOGETHER = 2
 """Number of adjacent bins that must show paint: paint shorter than a metre is a spot."""
 COVER_REACH_M = 3.0
 """Half the gap of broken marks: paint makes this much of the line before and behind it visible."""
+REACH_BINS = round(COVER_REACH_M / COVER_BIN_M)
+RUN = np.ones((1, COVER_BINS_TOGETHER), dtype=np.uint8)
+"""The bins of a run, and in `RUN_AND_REACH` also those that the run makes visible: kernels of morphology."""
+RUN_AND_REACH = np.ones((1, COVER_BINS_TOGETHER + 2 * REACH_BINS), dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,22 +130,22 @@ def fit_lane(
     `expected` is the expected centre, if there is one.
     """
     lane_indices = np.flatnonzero(sides)
-    line_points, side = Points(points.x_m[lane_indices], points.y_m[lane_indices]), sides[lane_indices]
-    fit: _CentreFit | None
-    if expected is None:
-        fit = _fit_once(line_points, side, width_m, slope_centre=(0.0, 0.0, 0.0))
-    else:
-        fit = _CentreFit(expected, width_m)
+    line = _line_points(points.x_m[lane_indices], points.y_m[lane_indices], sides[lane_indices])
+    fit = _fit_once(line, width_m, np.ones(len(line.x_m))) if expected is None else _CentreFit(expected, width_m)
     for half_weight_m in HALF_WEIGHT_M:
         if fit is None:
             return None
-        weights = 1 / (1 + (_residual_m(line_points, side, *fit) / half_weight_m) ** 2)
-        fit = _fit_once(line_points, side, width_m, slope_centre=fit.centre, weights=weights)
+        middle_m, slope_factor = evaluate_centre(line.x_m, fit.centre)
+        residual_m = (line.y_m - middle_m) / slope_factor - line.side * (fit.width_m / 2)
+        weights = 1 / (1 + (residual_m / half_weight_m) ** 2)
+        fit = _fit_once(line, width_m, slope_factor, weights)
     if fit is None:
         return None
-    is_on_line = np.abs(_residual_m(line_points, side, *fit)) < OUTLIER_M
-    kept, kept_side = Points(line_points.x_m[is_on_line], line_points.y_m[is_on_line]), side[is_on_line]
-    fit = _fit_once(kept, kept_side, width_m, slope_centre=fit.centre)
+    middle_m, slope_factor = evaluate_centre(line.x_m, fit.centre)
+    residual_m = (line.y_m - middle_m) / slope_factor - line.side * (fit.width_m / 2)
+    on_line = np.flatnonzero(np.abs(residual_m) < OUTLIER_M)
+    kept = _line_points(line.x_m[on_line], line.y_m[on_line], line.side[on_line])
+    fit = _fit_once(kept, width_m, slope_factor[on_line])
     if fit is None:
         return None
     centre, fitted_width_m = fit
@@ -152,8 +155,9 @@ def fit_lane(
     offset_m = lateral_offset_m(points, centre)
     outside_m = np.abs(offset_m) - fitted_width_m / 2  # distance beyond the nearer line; negative inside the lane
     line_distance_m = np.abs(outside_m)
-    left_visible, left_clear = line_shares(points.x_m[offset_m > 0], line_distance_m[offset_m > 0], grid)
-    right_visible, right_clear = line_shares(points.x_m[offset_m < 0], line_distance_m[offset_m < 0], grid)
+    (left_visible, right_visible), (left_clear, right_clear) = line_shares(
+        points.x_m, line_distance_m, offset_m < 0, grid
+    )
     return LaneFit(
         centre=centre,
         width_m=fitted_width_m,
@@ -181,10 +185,6 @@ def lateral_offset_m(points: Points, centre: tuple[float, float, float]) -> Floa
     return (points.y_m - middle) / slope_factor
 
 
-def _residual_m(points: Points, side: Sides, centre: tuple[float, float, float], width_m: float) -> FloatArray:
-    return lateral_offset_m(points, centre) - side * width_m / 2
-
-
 class _CentreFit(NamedTuple):
     """A lane's centre c0, c1, c2 and its width."""
 
@@ -192,27 +192,43 @@ class _CentreFit(NamedTuple):
     width_m: float
 
 
+class _LinePoints(NamedTuple):
+    """The points of a lane's lines, and what all fits to them share."""
+
+    x_m: FloatArray
+    y_m: FloatArray
+    side: FloatArray
+    """For each point +1: left line, -1: right line."""
+    left: int
+    right: int
+    """The number of points of each line."""
+    design: FloatArray
+    """Factors of the unknowns, (3 or 4, n): 1, x, x^2 unless the points are too near each other, and a free row."""
+
+
+def _line_points(x_m: FloatArray, y_m: FloatArray, sides: NDArray[np.int8] | FloatArray) -> _LinePoints:
+    left = int(np.count_nonzero(sides > 0))
+    is_curved = len(x_m) > 0 and float(x_m.max() - x_m.min()) >= LINEAR_BELOW_M
+    design = np.ones((4 if is_curved else 3, len(x_m)))
+    design[1] = x_m
+    if is_curved:
+        np.multiply(x_m, x_m, out=design[2])
+    return _LinePoints(x_m, y_m, sides.astype(np.float64), left, len(x_m) - left, design)
+
+
 def _fit_once(
-    points: Points,
-    side: Sides,
+    line: _LinePoints,
     width_m: float,
-    slope_centre: tuple[float, float, float],
+    slope_factor: FloatArray,
     weights: FloatArray | None = None,
 ) -> _CentreFit | None:
-    """Fit centre and width by least squares; the slopes of the lines are those of an earlier centre."""
-    left = int(np.count_nonzero(side > 0))
-    right = len(side) - left
-    if max(left, right) < MIN_LINE_POINTS:
+    """Fit centre and width by least squares; the slope factors of the lines are those of an earlier centre."""
+    if max(line.left, line.right) < MIN_LINE_POINTS:
         return None
-    x, y = points.x_m, points.y_m
-    _, slope_factor = evaluate_centre(x, slope_centre)
-    half_lane = side * slope_factor / 2
-    curve = [np.ones_like(x), x]
-    if float(np.ptp(x)) >= LINEAR_BELOW_M:
-        curve.append(x * x)
-    weight = curve[0] if weights is None else weights
-    if min(left, right) >= MIN_LINE_POINTS:
-        solved = _solve([*curve, half_lane], y, weight)
+    design, y = line.design, line.y_m
+    np.multiply(line.side, slope_factor / 2, out=design[-1])
+    if min(line.left, line.right) >= MIN_LINE_POINTS:
+        solved = _solve(design, y, weights)
         if solved is None:
             return None
         *centre, fitted_width_m = solved
@@ -220,15 +236,17 @@ def _fit_once(
         if narrowest_m <= fitted_width_m <= widest_m:
             return _CentreFit(_centre(centre), float(fitted_width_m))
     # One line, or two that are not a lane's width apart: use the line with more points.
-    majority = side == (1 if left >= right else -1)
-    solved = _solve([column[majority] for column in curve], (y - width_m * half_lane)[majority], weight[majority])
+    majority = line.side == (1 if line.left >= line.right else -1)
+    of_majority = design[:, majority]
+    solved = _solve(
+        of_majority[:-1], y[majority] - width_m * of_majority[-1], None if weights is None else weights[majority]
+    )
     return None if solved is None else _CentreFit(_centre(solved.tolist()), width_m)
 
 
-def _solve(columns: list[FloatArray], y: FloatArray, weight: FloatArray) -> FloatArray | None:
+def _solve(design: FloatArray, y: FloatArray, weights: FloatArray | None) -> FloatArray | None:
     """Solve the normal equations for up to four unknowns; None if the points do not determine the unknowns."""
-    design = np.stack(columns)
-    weighted = design * weight
+    weighted = design if weights is None else design * weights
     try:
         return np.asarray(np.linalg.solve(weighted @ design.T, weighted @ y), dtype=np.float64)
     except np.linalg.LinAlgError:
@@ -241,38 +259,40 @@ def _centre(coefficients: Sequence[float]) -> tuple[float, float, float]:
     return c0, c1, c2[0] if c2 else 0.0
 
 
-def line_shares(x_m: FloatArray, distance_m: FloatArray, grid: GroundGrid) -> tuple[float, float]:
-    """Return the shares of the grid's length on which a line is visible and clear; gaps of broken marks are, too.
+def line_shares(
+    x_m: FloatArray, distance_m: FloatArray, is_right: NDArray[np.bool_], grid: GroundGrid
+) -> tuple[list[float], list[float]]:
+    """Return the shares of the grid's length on which two lines, left and right, are visible, and those where clear.
 
-    `distance_m` are the points' distances from the line. Only clean paint makes a line visible: paint where most points
-    near the line are on it. A line is not clear where other paint is beside it, and less clear as a whole the wider
-    its paint is spread, after points at random have been subtracted.
+    `distance_m` are the points' distances from their line. Only clean paint makes a line visible: paint where most
+    points near the line are on it. The gaps of broken marks are visible, too. A line is not clear where other paint is
+    beside it, and less clear as a whole the wider its paint is spread, after points at random have been subtracted.
     """
+    near = np.flatnonzero(distance_m < CORRIDOR_M)
+    distance_m, line = distance_m[near], is_right[near].astype(np.intp)
     bins = round((grid.far_m - grid.near_m) / COVER_BIN_M)
-    bin_of_point = np.minimum(((x_m - grid.near_m) / COVER_BIN_M).astype(np.int64), bins - 1)
-    on_line = np.bincount(bin_of_point[distance_m < COVER_LINE_M], minlength=bins)
-    beside = np.bincount(bin_of_point[distance_m < CORRIDOR_M], minlength=bins)
-    clean = (on_line >= MIN_COVER_POINTS) & (on_line >= MIN_CLEAN_SHARE * beside)
-    runs = np.convolve(clean, np.ones(COVER_BINS_TOGETHER), mode="full") == COVER_BINS_TOGETHER
-    # A run is COVER_BINS_TOGETHER clean bins. The line is visible over each run and COVER_REACH_M before and behind it.
-    reach = round(COVER_REACH_M / COVER_BIN_M)
-    ends = np.flatnonzero(runs)  # the last bins of runs
-    visibility_steps = np.zeros(bins + 1)
-    np.add.at(visibility_steps, np.maximum(ends - COVER_BINS_TOGETHER + 1 - reach, 0), 1)
-    np.add.at(visibility_steps, np.minimum(ends + reach + 1, bins), -1)
-    visible = np.cumsum(visibility_steps)[:bins] > 0
-    has_other_paint = (beside >= MIN_COVER_POINTS) & ~clean
-    return float(np.mean(visible)), float(np.mean(visible & ~has_other_paint)) * _sharpness(distance_m)
+    bin_of_point = ((x_m[near] - grid.near_m) / COVER_BIN_M).astype(np.intp)
+    cell = np.minimum(bin_of_point, bins - 1) + bins * line
+    beside = np.bincount(cell, minlength=2 * bins)
+    on_line = np.bincount(cell[distance_m < COVER_LINE_M], minlength=2 * bins)
+    clean = ((on_line >= MIN_COVER_POINTS) & (on_line >= MIN_CLEAN_SHARE * beside)).reshape(2, bins)
+    # A run is COVER_BINS_TOGETHER clean bins. A line is visible over each run and COVER_REACH_M before and behind it.
+    starts = cv2.erode(clean.view(np.uint8), RUN, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    visible = cv2.dilate(starts, RUN_AND_REACH, anchor=(RUN_AND_REACH.shape[1] - REACH_BINS - 1, 0)).astype(np.bool_)
+    has_other_paint = (beside >= MIN_COVER_POINTS).reshape(2, bins) & ~clean
+    clear = np.count_nonzero(visible & ~has_other_paint, axis=1) / bins * _sharpness(distance_m, line)
+    return (np.count_nonzero(visible, axis=1) / bins).tolist(), clear.tolist()
 
 
-def _sharpness(distance_m: FloatArray) -> float:
-    """Return how sharp a line is, 0 to 1, from the points' distances from it."""
-    on_line_m = distance_m[distance_m < OUTLIER_M]
-    others = np.count_nonzero(distance_m < CORRIDOR_M) - len(on_line_m)
-    random_per_m = others / (CORRIDOR_M - OUTLIER_M)
-    count = len(on_line_m) - random_per_m * OUTLIER_M
-    if count < MIN_COVER_POINTS:
-        return 0.0
-    square_m2 = max(float(on_line_m @ on_line_m) - random_per_m * OUTLIER_M**3 / 3, 0.0) / count
+def _sharpness(distance_m: FloatArray, line: NDArray[np.intp]) -> FloatArray:
+    """Return how sharp two lines are, (2,), 0 to 1, from their points' distances from them, up to `CORRIDOR_M`."""
+    is_on_line = distance_m < OUTLIER_M
+    line_on, on_line_m = line[is_on_line], distance_m[is_on_line]
+    found = np.bincount(line_on, minlength=2)
+    random_per_m = (np.bincount(line, minlength=2) - found) / (CORRIDOR_M - OUTLIER_M)
+    count = found - random_per_m * OUTLIER_M
+    square_m2 = np.bincount(line_on, weights=on_line_m * on_line_m, minlength=2) - random_per_m * OUTLIER_M**3 / 3
     sharp_m, blurred_m = SHARP_SPREAD_M
-    return min(max((blurred_m - math.sqrt(square_m2)) / (blurred_m - sharp_m), 0.0), 1.0)
+    spread_m = np.sqrt(np.maximum(square_m2, 0.0) / np.maximum(count, MIN_COVER_POINTS))
+    sharpness = np.clip((blurred_m - spread_m) / (blurred_m - sharp_m), 0.0, 1.0)
+    return np.where(count < MIN_COVER_POINTS, 0.0, sharpness)

@@ -67,7 +67,7 @@ def white_paint(view: Picture, grid: GroundGrid) -> Mask:
 
 def yellow_paint(view: Picture, grid: GroundGrid) -> Mask:
     """Return a mask of narrow stripes that are yellower than both sides."""
-    return _stripes(yellowness_of(view), grid, YELLOW_ABOVE_ROAD, 1.0)
+    return _stripes(yellowness_of(view), grid, YELLOW_ABOVE_ROAD)
 
 
 def without_specks(paint: Mask) -> Mask:
@@ -76,15 +76,18 @@ def without_specks(paint: Mask) -> Mask:
     return np.asarray(cv2.bitwise_and(paint, filled), dtype=np.uint8)
 
 
-def _stripes(channel: Channel, grid: GroundGrid, above: int, ratio: float) -> Mask:
+def _stripes(channel: Channel, grid: GroundGrid, above: int, ratio: float | None = None) -> Mask:
     """Return a mask of the cells whose value exceeds the larger one of both sides by a difference and by a ratio."""
     clean = cv2.medianBlur(channel, DESPECKLE_CELLS)
     rows, reach = round(ALONG_M / grid.step_x_m), round(BESIDE_M / grid.step_y_m)
-    own = cv2.blur(clean, (1, rows))[:, reach:-reach]
+    # A mean along the road alone: cv2.blur would take nearly twice the time.
+    own = cv2.sepFilter2D(clean, -1, np.ones(1), np.full(rows, 1 / rows))[:, reach:-reach]
     beside = cv2.blur(clean, (round(BESIDE_WIDTH_M / grid.step_y_m), rows))
     larger = cv2.max(beside[:, : -2 * reach], beside[:, 2 * reach :])
-    by_difference = cv2.threshold(cv2.subtract(own, larger), above, 255, cv2.THRESH_BINARY)[1]
-    by_ratio = cv2.threshold(cv2.addWeighted(own, 1.0, larger, -ratio, 0.0), 0, 255, cv2.THRESH_BINARY)[1]
+    stripes = cv2.threshold(cv2.subtract(own, larger), above, 255, cv2.THRESH_BINARY)[1]
+    if ratio is not None:
+        exceeds = cv2.threshold(cv2.addWeighted(own, 1.0, larger, -ratio, 0.0), 0, 255, cv2.THRESH_BINARY)[1]
+        stripes = cv2.bitwise_and(stripes, exceeds)
     mask = np.zeros_like(channel)  # a cell at the rim has no second side
-    mask[:, reach:-reach] = cv2.bitwise_and(by_difference, by_ratio)
+    mask[:, reach:-reach] = stripes
     return mask

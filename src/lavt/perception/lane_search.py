@@ -184,5 +184,5 @@ def has_parallel(points: Points, fit: LaneFit, grid: GroundGrid) -> bool:
         return len(clear_sides) == 2
     (side,) = clear_sides
     distance_m = np.abs(lateral_offset_m(points, fit.centre) - side * 1.5 * fit.width_m)
-    visible, _ = line_shares(points.x_m, distance_m, grid)
+    (visible, _), _ = line_shares(points.x_m, distance_m, np.zeros(len(distance_m), dtype=np.bool_), grid)
     return visible >= MIN_PARALLEL_VISIBLE
