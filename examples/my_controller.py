@@ -42,7 +42,8 @@ class Stanley:
         heading_error_rad = math.atan(c1 + 2 * c2 * self._wheelbase_m)
         steering_rad = heading_error_rad + math.atan2(self.gain_per_s * lateral_error_m, max(speed_mps, 1.0))
         limit_rad = self._preset.steering_limit_rad
-        throttle = 0.0 if lane.confidence < 0.2 else min(max(self._preset.speed_mps - speed_mps, 0.0), 1.0)
+        missing_mps = self._preset.speed_mps - speed_mps if lane.confidence >= self._preset.lane_confidence else 0.0
+        throttle = min(max(missing_mps, 0.0), 1.0)
         path_per_m = (2 * c2,) * PATH_POINTS  # the vehicle follows this path after a command timeout
         return Decision(min(max(steering_rad, -limit_rad), limit_rad), throttle, 0.0, path_per_m)
 

@@ -45,6 +45,7 @@ from lavt.errors import UserError
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.side_configs import client_config
 from lavt.node import WAKE, Message
+from lavt.perception.lane_detector import GroundTruthLaneDetector, LaneDetector
 from lavt.runtime.pipeline import run_stages
 from lavt.transport.clock_sync.persistent_process import Shell
 from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
@@ -164,6 +165,28 @@ def test_configured_settings_replace_those_of_the_preset() -> None:
     assert by_changed.brake > 0
     assert changed.settings == "designed, lookahead_s 2, speed_mps 5"
     assert ControllerConfig().settings == "designed"
+
+
+@pytest.mark.parametrize("kind", ["lane_keeper", "two_point"])
+def test_the_configured_confidence_decides_whether_a_lane_is_followed(kind: str) -> None:
+    """A lane below `controller.lane_confidence` is neither steered by nor driven along, and results name the value."""
+    changed = ControllerConfig(kind=kind, lane_confidence=0.5)
+    lane = Lane(centre=(0.5, 0.0, 0.0), width_m=3.5, near_m=3.6, far_m=20.0, confidence=0.4)
+    by_changed, by_default = (build_controller(config).decide(lane, 2.0, 0) for config in (changed, ControllerConfig()))
+    assert (by_changed.steering_rad, by_changed.throttle) == (0.0, 0.0)
+    assert by_default.steering_rad > 0
+    assert by_default.throttle > 0
+    assert "lane_confidence 0.5" in changed.settings
+
+
+@pytest.mark.parametrize(("lane_confidence", "expected"), [(0.1, 0.1), (None, 0.2), (0.6, 0.2)])
+def test_a_lane_that_may_be_followed_is_tracked(lane_confidence: float | None, expected: float) -> None:
+    """The detector tracks lanes down to the configured confidence, and in any case down to 0.2."""
+    config = ClientConfig(controller=ControllerConfig(lane_confidence=lane_confidence))
+    for name in ("pixels", "geometry"):
+        detector = FIDELITIES[name]().detector(config)
+        assert isinstance(detector, LaneDetector | GroundTruthLaneDetector)
+        assert detector._track_confidence == expected
 
 
 def test_the_configured_human_model_drives() -> None:

@@ -28,6 +28,14 @@ def test_a_lane_restarts_the_timer() -> None:
     assert watch.check(0.0, START_NS + 2 * BRAKE_AFTER_NS) == "ok"
 
 
+def test_the_threshold_is_a_setting() -> None:
+    """A lane below the given threshold does not restart the timer, and one at the threshold does."""
+    watch = LaneWatch(0.5)
+    watch.check(1.0, START_NS)
+    assert watch.check(0.49, START_NS + BRAKE_AFTER_NS) == "brake"
+    assert watch.check(0.5, START_NS + BRAKE_AFTER_NS + 1) == "ok"
+
+
 def test_the_first_picture_starts_the_timer() -> None:
     """If no lane was ever detected, the timer counts from the first picture."""
     watch = LaneWatch()

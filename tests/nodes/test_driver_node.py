@@ -14,6 +14,7 @@ from tests.nodes.stand_ins import MONO_NS, SMALL_CAMERA, WALL_NS, at, deliver, n
 from lavt.channels import CHANNELS
 from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.control.drive_controller import DriveController, make_controller
+from lavt.control.lane_watch import LANE_CONFIDENCE
 from lavt.control.preset import DESIGNED
 from lavt.domain import (
     NS_PER_MS,
@@ -83,7 +84,12 @@ class StampedController(FakeController):
 class Bench:
     """A driver node, with methods that deliver the messages of the vehicle's side."""
 
-    def __init__(self, detector: LaneDetector | None = None, controller: DriveController | None = None) -> None:
+    def __init__(
+        self,
+        detector: LaneDetector | None = None,
+        controller: DriveController | None = None,
+        lane_confidence: float = LANE_CONFIDENCE,
+    ) -> None:
         self.controller = controller or FakeController()
         self.detector = FakeLaneDetector()
         self.session = ClientSession("alice", 1, rearm=False, start_ns=MONO_NS)
@@ -93,6 +99,7 @@ class Bench:
             self.controller,
             self.session,
             CLIENT_LIMITS,
+            lane_confidence=lane_confidence,
         )
         self.mono_ns = 0
         self.sends: list[Send] = []
@@ -316,6 +323,18 @@ def test_without_a_lane_the_driver_brakes_and_stops(lost_ms: int, mode: str, kin
         (command,) = bench.deliver_picture()
     assert command.mode == mode
     assert (command.brake >= CLIENT_LIMITS.brake) == brakes
+
+
+@pytest.mark.parametrize(("lane_confidence", "mode"), [(0.2, "drive"), (0.5, "stop")])
+def test_the_threshold_decides_whether_a_lane_is_lost(lane_confidence: float, mode: str) -> None:
+    """With lanes of confidence 0.4 for 2.52 s, the driver drives at a threshold of 0.2 and stops at 0.5."""
+    bench = Bench(lane_confidence=lane_confidence).start_driving()
+    bench.detector.confidence = 0.4
+    for _ in range(2520 // 20):
+        bench.mono_ns += 20 * NS_PER_MS
+        bench.deliver_state("driving")
+        (command,) = bench.deliver_picture()
+    assert command.mode == mode
 
 
 def test_a_controller_that_reads_stamps_gets_the_stamp_of_each_picture() -> None:

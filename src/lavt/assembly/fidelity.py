@@ -9,7 +9,7 @@ from lavt.assembly.cameras import client_camera
 from lavt.assembly.vehicles import VehicleSetup, build_geometry_setup, build_vehicle_setup
 from lavt.config import ClientConfig, ServerConfig
 from lavt.nodes.driver import LaneDetection
-from lavt.perception.lane_detector import GroundTruthLaneDetector, LaneDetector
+from lavt.perception.lane_detector import TRACK_CONFIDENCE, GroundTruthLaneDetector, LaneDetector
 from lavt.transport.video.frame_codec import (
     InMemoryFrameCodec,
     LaneReceiver,
@@ -53,8 +53,17 @@ def _video_receiver(config: ClientConfig) -> VideoReceiver:
     return VideoReceiver(Decoder(), (camera.height_px, camera.width_px))
 
 
+def _track_confidence(config: ClientConfig) -> float:
+    """Return the lowest confidence of a tracked lane: a lane that may be followed is tracked."""
+    return min(TRACK_CONFIDENCE, config.controller.effective_preset().lane_confidence)
+
+
 def _lane_detector(config: ClientConfig) -> LaneDetector:
-    return LaneDetector(client_camera(config.camera))
+    return LaneDetector(client_camera(config.camera), track_confidence=_track_confidence(config))
+
+
+def _ground_truth_detector(config: ClientConfig) -> GroundTruthLaneDetector:
+    return GroundTruthLaneDetector(_track_confidence(config))
 
 
 VIDEO = FidelityModel(build_vehicle_setup, _video_sender, _video_receiver, _lane_detector)
@@ -66,9 +75,7 @@ def _pixels() -> FidelityModel:
 
 
 def _geometry() -> FidelityModel:
-    return FidelityModel(
-        build_geometry_setup, lambda _: LaneSender(), lambda _: LaneReceiver(), lambda _: GroundTruthLaneDetector()
-    )
+    return FidelityModel(build_geometry_setup, lambda _: LaneSender(), lambda _: LaneReceiver(), _ground_truth_detector)
 
 
 FIDELITIES: dict[str, Callable[[], FidelityModel]] = {

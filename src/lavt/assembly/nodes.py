@@ -18,7 +18,6 @@ from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.control.drive_controller import DriveController, make_controller
 from lavt.control.human_controls import HUMAN_LIMITS, HumanControls
 from lavt.control.prediction import CarModel
-from lavt.control.preset import Preset, find_preset
 from lavt.control.two_point import TWO_POINT, TwoPointDriver, TwoPointSettings
 from lavt.domain import NS_PER_MS, Now
 from lavt.errors import UserError
@@ -102,18 +101,13 @@ def build_controller(config: ControllerConfig, seed: int = 1) -> DriveController
         raise UserError("a person drives by `lavt drive` or `lavt client CONFIG --human` only: name another controller")
     if config.kind == TWO_POINT:
         model = TwoPointSettings(**config.two_point.model_dump())
-        return TwoPointDriver(_settings(config), wheelbase_m=config.wheelbase_m, settings=model, seed=seed)
-    return make_controller(config.kind, _settings(config), config.wheelbase_m)
-
-
-def _settings(config: ControllerConfig) -> Preset:
-    """Return the preset with the changes of the config; raise `UserError` for an unknown preset."""
-    return replace(find_preset(config.preset), **config.changes)
+        return TwoPointDriver(config.effective_preset(), wheelbase_m=config.wheelbase_m, settings=model, seed=seed)
+    return make_controller(config.kind, config.effective_preset(), config.wheelbase_m)
 
 
 def build_controls(config: ControllerConfig) -> HumanControls:
     """Build the controls of a person; of the preset, they use the limits and the speed."""
-    settings = _settings(config)
+    settings = config.effective_preset()
     limits = replace(
         HUMAN_LIMITS,
         steering_limit_rad=min(settings.steering_limit_rad, HUMAN_LIMITS.steering_limit_rad),
@@ -284,14 +278,17 @@ def build_client(
 
 def _page_watch(config: ClientConfig, instance: int) -> PageWatchNode:
     controller, camera = config.controller, client_camera(config.camera)
-    return PageWatchNode(controller.kind, _settings(controller).speed_mps, camera, (config.who, instance))
+    return PageWatchNode(controller.kind, controller.effective_preset().speed_mps, camera, (config.who, instance))
 
 
 def _driver(config: ClientConfig, fidelity: FidelityModel) -> Callable[[ClientSession], DriverNode]:
     """Prepare a driver node with the configured controller; return a function that builds it for a session."""
     reader, detector = PictureReader(fidelity.receiver(config)), fidelity.detector(config)
     controller = build_controller(config.controller, config.seed)
-    return lambda session: DriverNode(reader, detector, controller, session, CLIENT_LIMITS)
+    lane_confidence = config.controller.effective_preset().lane_confidence
+    return lambda session: DriverNode(
+        reader, detector, controller, session, CLIENT_LIMITS, lane_confidence=lane_confidence
+    )
 
 
 def _human_driver(

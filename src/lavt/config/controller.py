@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from pydantic import Field, model_validator
 
 from lavt.config.section import Section
 from lavt.config.vehicle import MAX_SIMULATED_MPS
+from lavt.control.preset import Preset, find_preset
 from lavt.control.two_point import TWO_POINT, TwoPointSettings
 
 HUMAN = "human"
@@ -81,7 +83,7 @@ class ControllerConfig(Section):
     preset: str = "designed"
     """The set of gains: designed (found by theory) or paper_calibrated (fitted to the paper, `docs/controllers.md`)."""
     lookahead_s: float | None = Field(None, ge=0.2, le=5)
-    """How far ahead the car aims, in seconds of driving. This key and the three below replace the preset's values."""
+    """How far ahead the car aims, in seconds of driving. This key and the four below replace the preset's values."""
     steering_limit_rad: float | None = Field(None, gt=0, le=0.5)
     """The limit of the angle of the road wheels."""
     lateral_limit_mps2: float | None = Field(None, gt=0, le=20)
@@ -89,6 +91,9 @@ class ControllerConfig(Section):
     speed_mps: float | None = Field(None, ge=1, le=MAX_SIMULATED_MPS)
     """The target speed. The vehicle allows no throttle above `safety.speed_limit_mps`, which is at most 40 km/h for a
     vehicle that is not simulated."""
+    lane_confidence: float | None = Field(None, ge=0.05, le=0.95)
+    """The lowest confidence of a lane that is followed, a share of 1; 0.2 in both presets (`docs/perception.md`). A
+    picture with less counts as a picture without a lane."""
     two_point: TwoPointConfig = TwoPointConfig()
     prediction: PredictionConfig = PredictionConfig()
     wheelbase_m: float = Field(2.8448, gt=0.5, lt=10)
@@ -103,8 +108,12 @@ class ControllerConfig(Section):
     @property
     def changes(self) -> dict[str, Any]:
         """Settings that replace the preset's values."""
-        settings = ("lookahead_s", "steering_limit_rad", "lateral_limit_mps2", "speed_mps")
+        settings = ("lookahead_s", "steering_limit_rad", "lateral_limit_mps2", "speed_mps", "lane_confidence")
         return {name: value for name in settings if (value := getattr(self, name)) is not None}
+
+    def effective_preset(self) -> Preset:
+        """Return the preset with the changes; raise `UserError` for an unknown preset."""
+        return replace(find_preset(self.preset), **self.changes)
 
     @property
     def settings(self) -> str:

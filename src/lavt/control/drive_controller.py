@@ -49,8 +49,8 @@ class LaneKeeper:
     def __init__(self, preset: Preset, *, wheelbase_m: float) -> None:
         self._preset = preset
         self._wheelbase_m = wheelbase_m
-        self._speed_keeper = SpeedKeeper(preset.speed_mps)
-        self._remembered = RememberedLane()
+        self._speed_keeper = SpeedKeeper(preset.speed_mps, preset.lane_confidence)
+        self._remembered = RememberedLane(preset.lane_confidence)
         self._curvature_per_m = 0.0
         self._decided_ns: int | None = None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from lavt.control.lane_watch import LANE_CONFIDENCE
 from lavt.control.pure_pursuit import curvature_per_m
 from lavt.errors import UserError
 
@@ -24,6 +25,8 @@ class Preset:
     lateral_limit_mps2: float = math.inf
     steering_limit_rad: float = WHEEL_LIMIT_RAD
     speed_mps: float = 30 / 3.6
+    lane_confidence: float = LANE_CONFIDENCE
+    """The lowest confidence, 0 to 1, of a lane that is followed."""
 
     def curvature_limit_per_m(self, speed_mps: float, wheelbase_m: float) -> float:
         """Return the smaller of the steering limit and the lateral acceleration limit at this speed, as a curvature."""

@@ -103,7 +103,8 @@ def pursuit_path_per_m(
 class RememberedLane:
     """The last lane detected with confidence, and the car's pose in the frame of this lane."""
 
-    def __init__(self) -> None:
+    def __init__(self, lane_confidence: float = LANE_CONFIDENCE) -> None:
+        self._lane_confidence = lane_confidence
         self.lane = Lane((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0)
         self.pose = ORIGIN
 
@@ -112,7 +113,7 @@ class RememberedLane:
 
         Otherwise move the pose by dead reckoning: the car has driven `driven_m` with the commanded curvature.
         """
-        is_confident = lane.confidence >= LANE_CONFIDENCE
+        is_confident = lane.confidence >= self._lane_confidence
         if is_confident:
             self.lane, self.pose = lane, ORIGIN
         else:

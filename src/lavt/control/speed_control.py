@@ -67,8 +67,9 @@ def speed_for_confidence_mps(speed_mps: float, confidence: float) -> float:
 class SpeedKeeper:
     """The pedals of a driver that keeps a speed: PI control, slower if the lane is badly visible."""
 
-    def __init__(self, speed_mps: float) -> None:
+    def __init__(self, speed_mps: float, lane_confidence: float = LANE_CONFIDENCE) -> None:
         self._full_speed_mps = speed_mps
+        self._lane_confidence = lane_confidence
         self._controller = SpeedPiController()
 
     def pedals(self, confidence: float, speed_mps: float, step_s: float) -> tuple[float, float]:
@@ -76,7 +77,7 @@ class SpeedKeeper:
 
         Without a lane both are 0: braking would jolt the car at each failed picture.
         """
-        if confidence < LANE_CONFIDENCE:
+        if confidence < self._lane_confidence:
             return pedals(0.0)
         target_mps = speed_for_confidence_mps(self._full_speed_mps, confidence)
         return pedals(self._controller.acceleration_mps2(target_mps, speed_mps, step_s))

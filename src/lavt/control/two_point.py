@@ -84,8 +84,8 @@ class TwoPointDriver:
         self._preset = preset
         self._wheelbase_m = wheelbase_m
         self._settings = settings or TwoPointSettings()
-        self._speed_keeper = SpeedKeeper(preset.speed_mps)
-        self._remembered = RememberedLane()
+        self._speed_keeper = SpeedKeeper(preset.speed_mps, preset.lane_confidence)
+        self._remembered = RememberedLane(preset.lane_confidence)
         self._steering = SteeringLaw(self._settings, IndexedStream(seed, "two-point noise"))
         self._arms = Arms(self._settings)
         self._stamp_ns: int | None = None

@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from lavt.control.client_limits import ClientLimits
 from lavt.control.drive_controller import DriveController, StampReader
-from lavt.control.lane_watch import LaneState, LaneWatch
+from lavt.control.lane_watch import LANE_CONFIDENCE, LaneState, LaneWatch
 from lavt.domain import Decision, FramePayload, Lane, Mode, Now
 from lavt.node import Message, Send, Stage
 from lavt.nodes.client_session import ClientSession
@@ -46,7 +46,8 @@ class DriverNode(Commander):
     """The node that drives by the received pictures and the reported speed only.
 
     Every access unit is decoded, but the lane is detected only in the newest waiting picture. A command is sent
-    with each detection, and at the latest `limits.command_period_ns` after the previous command.
+    with each detection, and at the latest `limits.command_period_ns` after the previous command. A lane with less than
+    `lane_confidence` is treated as lost.
     """
 
     def __init__(
@@ -56,13 +57,15 @@ class DriverNode(Commander):
         controller: DriveController,
         session: ClientSession,
         limits: ClientLimits,
+        *,
+        lane_confidence: float = LANE_CONFIDENCE,
     ) -> None:
         super().__init__(session, limits)
         self._reader = reader
         self._detector = detector
         self._controller = controller
         self._stamp_reader = controller if isinstance(controller, StampReader) else None
-        self._lane_watch = LaneWatch()
+        self._lane_watch = LaneWatch(lane_confidence)
         self._detected_stamp_ns = 0
         self._decision: Decision | None = None
         self._lane_state: LaneState = "ok"

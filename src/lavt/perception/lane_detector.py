@@ -22,7 +22,7 @@ GRID = GroundGrid()
 LANE_WIDTH_M = 3.5
 """The lane's width until it has been measured."""
 TRACK_CONFIDENCE = 0.2
-"""A lane with less confidence is not tracked. One line that is visible over 40 % of the length gives 0.2."""
+"""By default a lane with less confidence is not tracked. One line that is visible over 40 % of the length gives 0.2."""
 MIN_CLEARNESS = 0.35
 """A search finds no lane with less clearness (`LaneFit.clearness`): there is no earlier picture that supports it."""
 START_LANES = 3
@@ -80,12 +80,14 @@ class LaneDetector:
         lane_width_m: float = LANE_WIDTH_M,
         *,
         stamped: bool = True,
+        track_confidence: float = TRACK_CONFIDENCE,
     ) -> None:
         calibration = calibrated_pinhole_camera(camera) if isinstance(camera, CameraModel) else camera
         self._shape = (calibration.height_px, calibration.width_px, 3)
         self.bird_eye = make_bird_eye(calibration, grid, stamped=stamped)
         self.trace: DetectionTrace | None = None
         self._lane_width_m = lane_width_m
+        self._track_confidence = track_confidence
         self._lane = Lane((0.0, 0.0, 0.0), lane_width_m, grid.near_m, grid.far_m, 0.0)
         self._misses = FORGET_AFTER_PICTURES
 
@@ -103,7 +105,7 @@ class LaneDetector:
         tracked = self._misses < FORGET_AFTER_PICTURES
         self.trace = self._track(mask, points) if tracked else self._search(mask, points)
         fit = self.trace.fit
-        if fit is None or fit.confidence < TRACK_CONFIDENCE:
+        if fit is None or fit.confidence < self._track_confidence:
             self._misses += 1
             self._lane = replace(self._lane, confidence=0.0 if fit is None else fit.confidence)
         else:
@@ -159,7 +161,8 @@ class GroundTruthLaneDetector:
     the confidence is low and the lane is the last one detected.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, track_confidence: float = TRACK_CONFIDENCE) -> None:
+        self._track_confidence = track_confidence
         self._lane = Lane((0.0, 0.0, 0.0), LANE_WIDTH_M, GRID.near_m, GRID.far_m, 0.0)
         self._misses = FORGET_AFTER_PICTURES
 
@@ -170,7 +173,7 @@ class GroundTruthLaneDetector:
     def detect(self, seen_lane: SeenLane) -> Lane:
         """Return the moving average of this lane and the previous ones."""
         lane = seen_lane.lane
-        if lane.confidence < TRACK_CONFIDENCE:
+        if lane.confidence < self._track_confidence:
             self._misses += 1
             self._lane = replace(self._lane, confidence=lane.confidence)
         else:

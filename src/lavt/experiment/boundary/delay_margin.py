@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ from scipy.linalg import expm
 
 from lavt.assembly.simulators import car_of
 from lavt.config import RunConfig
-from lavt.control.preset import find_preset
 from lavt.control.pure_pursuit import lookahead_m
 from lavt.domain import FloatArray
 from lavt.perception.lane_detector import SMOOTHING
@@ -79,7 +78,7 @@ def configured_loop(config: RunConfig) -> LateralLoop | None:
     controller, vehicle = config.controller, config.vehicle
     if (controller.kind, vehicle.kind) != ("lane_keeper", "simulator"):
         return None
-    preset = replace(find_preset(controller.preset), **controller.changes)
+    preset = controller.effective_preset()
     return LateralLoop(
         lookahead_s=lookahead_m(preset.lookahead_s, preset.speed_mps) / preset.speed_mps,
         speed_mps=preset.speed_mps,
