@@ -38,9 +38,9 @@ from lavt.vehicle.sim.road.strips import (
 TILE_M = (8.0, 16.0, 32.0, 32.0, 64.0)
 """The length of a tile's edge at each scale."""
 
-_MAX_TILES = (40, 60, 160, 400, 400)
+_MAX_TILES = (300, 160, 160, 400, 400)
 """The number of cached tiles of each scale. Tiles of the two finest scales are painted during the drive, a few at a
-time. For the other scales, all tiles along a road fit into the cache."""
+time. All tiles along a route of 600 m fit into the cache, so the next run on the same route needs no new ones."""
 
 _GRAVEL_WIDTH_M = 1.6
 _PAINT = {"white": (212, 218, 216), "yellow": (62, 172, 208)}

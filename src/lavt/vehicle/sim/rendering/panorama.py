@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,20 +33,25 @@ class Panorama:
     """The panorama for one camera model; a picture's background consists of columns of the panorama."""
 
     def __init__(self, model: CameraModel, rows: int, light: Light, *, plain: bool) -> None:
+        self._columns = np.empty((model.width_px, rows), dtype=np.int32)
         self._texels = _paint(rows, horizon_row(model), model.focal_px, light, plain=plain)
         across_px = np.arange(model.width_px) - principal_point(model)[0]
         self._azimuth_rad = np.arctan2(across_px, model.focal_px)
 
     def crop(self, heading_rad: float, out: Picture) -> None:
         """Write the background for a camera heading into `out` (rows, columns, 4), the first rows of the picture."""
+        if not len(out):  # a camera that looks down
+            return
         turn = (self._azimuth_rad - heading_rad) / (2 * math.pi)
         columns = np.rint((turn - np.floor(turn)) * _COLUMNS).astype(np.intp) % _COLUMNS
-        np.take(self._texels, columns, axis=1, out=out.view(np.uint32)[..., 0], mode="clip")
+        # Taking columns from a transposed panorama and transposing them takes half the time of taking them from rows.
+        np.take(self._texels, columns, axis=0, out=self._columns, mode="clip")
+        cv2.transpose(self._columns, out.view(np.int32)[..., 0])
 
 
 @lru_cache(maxsize=6)
-def _paint(rows: int, horizon: float, focal_px: float, light: Light, *, plain: bool) -> NDArray[np.uint32]:
-    """Return the panorama (rows, columns); each texel is a 32-bit word of blue, green, red and an unused byte."""
+def _paint(rows: int, horizon: float, focal_px: float, light: Light, *, plain: bool) -> NDArray[np.int32]:
+    """Return the transposed panorama (columns, rows); a texel is a word of blue, green, red and an unused byte."""
     # The height of each row above the horizon, as a share of the focal length.
     height = np.asarray((horizon - np.arange(rows)) / focal_px, dtype=np.float64)[:, None]
     # A column shows the azimuth -turn: azimuths increase to the left, and columns to the right.
@@ -65,7 +71,7 @@ def _paint(rows: int, horizon: float, focal_px: float, light: Light, *, plain: b
     _add_ridge(picture, height, 0.020 + 0.0035 * _wood_outline(), _hazed_colour(_WOOD_COLOUR, light, 0.2))
     words = np.zeros((rows, _COLUMNS, 4), dtype=np.uint8)
     words[..., :3] = np.clip(np.rint(picture), 0, 255)
-    return np.asarray(words.view(np.uint32)[..., 0], dtype=np.uint32)
+    return np.ascontiguousarray(words.view(np.int32)[..., 0].T)
 
 
 def _angle_to_sun_rad(light: Light, elevation_rad: FloatArray, azimuth_rad: FloatArray) -> FloatArray:

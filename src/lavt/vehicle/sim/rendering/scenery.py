@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable
-from itertools import repeat
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice, repeat
 from operator import itemgetter
 from typing import Any
 
@@ -37,9 +36,14 @@ class Scenery:
     def __init__(self, objects: RoadsideObjects, light: Light, haze_m: float = HAZE_M) -> None:
         self._objects = objects
         faces, walls = objects.faces, objects.walls
+        self._face_ends_m = _ends(faces.corners_m)
         self._colours = faces.colours * light.upright_factors(faces.normals)
+        x_m, y_m, foot_heights_m, top_heights_m, self._pole_widths_m = objects.poles.T
+        ends_m = [np.column_stack([x_m, y_m, heights_m]) for heights_m in (foot_heights_m, top_heights_m)]
+        self._pole_ends_m = np.stack(ends_m, axis=1)
         self._pole_colour = _POLE_GREY * light.upright_factors(np.zeros((1, 2)))
         self._wall_colours = walls.colours * light.upright_factors(walls.normals)
+        self._wall_ends_m = _ends(walls.outlines_m)
         self._glass = np.array(_GLASS_COLOUR) * light.upright_factors(walls.normals)
         # Sprites show trees with the sun on the left. So a sprite is mirrored if the sun is to the right of the road.
         mirrored = np.sin(light.azimuth_rad - objects.tree_road_rad) < 0
@@ -66,24 +70,21 @@ class Scenery:
 
     def _face_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
         faces = self._objects.faces
-        corners = faces.corners_m
-        ahead = _depth_m(corners[:, :2, :2], placement)
-        in_range = np.flatnonzero((ahead.max(axis=1) > _NEAR_M) & (ahead.min(axis=1) < faces.visible_to_m))
-        ahead = ahead[in_range]
-        points = placement.project(_clip(corners[in_range], ahead))
-        inside = (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < placement.model.width_px)
+        begin, end = ahead = placement.depth_m(*self._face_ends_m)
+        in_range = np.flatnonzero((np.maximum(begin, end) > _NEAR_M) & (np.minimum(begin, end) < faces.visible_to_m))
+        ahead = ahead.T[in_range]
+        points = placement.project(_clip(faces.corners_m[in_range], ahead))
+        inside = _is_across(points, placement)
         # All faces of one piece of a rail have the same depth.
         depth = np.maximum(ahead[inside], _NEAR_M).mean(axis=1)
         shades = self._add_haze(self._colours[in_range[inside]], depth)
         return zip(depth.tolist(), repeat(_polygon), _subpixels(points[inside]), shades.tolist())
 
     def _pole_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
-        ahead = _depth_m(self._objects.poles[:, :2], placement)
+        ahead = placement.depth_m(*self._pole_ends_m[:, 0, :2].T)
         visible = (ahead > 1.0) & (ahead < FAR_M)
         depth = ahead[visible]
-        x_m, y_m, foot_heights_m, top_heights_m, widths_m = self._objects.poles[visible].T
-        feet_m, tops_m = np.column_stack([x_m, y_m, foot_heights_m]), np.column_stack([x_m, y_m, top_heights_m])
-        ends = placement.project(np.stack([feet_m, tops_m], axis=1))
+        ends, widths_m = placement.project(self._pole_ends_m[visible]), self._pole_widths_m[visible]
         feet_u_px = ends[:, 0, 0]
         inside = (feet_u_px > -20) & (feet_u_px < placement.model.width_px + 20)
         depth = depth[inside]
@@ -94,7 +95,7 @@ class Scenery:
         return zip((depth + 0.3).tolist(), repeat(_line), _subpixels(ends[inside]).tolist(), styles)
 
     def _tree_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
-        ahead = _depth_m(self._trees[:, :2], placement)
+        ahead = placement.depth_m(*self._trees[:, :2].T)
         trees = self._trees[(ahead > 3.0) & (ahead < FAR_M)]
         x_m, y_m, heights_m, kinds, mirrored = trees.T
         u_px, v_px, all_depths_m = placement.project(np.column_stack([x_m, y_m, np.zeros(len(trees))])).T
@@ -109,17 +110,18 @@ class Scenery:
     def _wall_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
         walls = self._objects.walls
         outlines = walls.outlines_m
-        begin, end = outlines[:, 0, :2], outlines[:, 1, :2]
+        begin_m, end_m = self._wall_ends_m.swapaxes(0, 1)  # each the coordinates x and y of all walls
         # A wall is visible from outside only. Seen from there, its beginning is on the left.
-        along = end - begin
-        in_view = (placement.x_m - begin[:, 0]) * along[:, 1] > (placement.y_m - begin[:, 1]) * along[:, 0]
-        ahead = _depth_m(outlines[:, :2, :2], placement)
-        in_view &= (ahead.min(axis=1) > _NEAR_M) & (ahead.min(axis=1) < FAR_M * 1.2)
+        along_x, along_y = end_m - begin_m
+        in_view = (placement.x_m - begin_m[0]) * along_y > (placement.y_m - begin_m[1]) * along_x
+        ahead = placement.depth_m(*self._wall_ends_m)
+        nearest = ahead.min(axis=0)
+        in_view &= (nearest > _NEAR_M) & (nearest < FAR_M * 1.2)
         points = placement.project(outlines)
-        in_view &= (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < placement.model.width_px)
+        in_view &= _is_across(points, placement)
         visible = np.flatnonzero(in_view)
-        depth = ahead[visible].mean(axis=1)
-        windows = [list(_subpixels(placement.project(walls.windows_m[wall]))) for wall in visible]
+        depth = ahead[:, visible].mean(axis=0)
+        windows = _project_groups(placement, [walls.windows_m[wall] for wall in visible])
         walls_and_glass = (
             self._add_haze(colours[visible], depth).tolist() for colours in (self._wall_colours, self._glass)
         )
@@ -150,10 +152,15 @@ def _facade(
     cv2.fillPoly(picture, windows, glass_colour, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
-def _depth_m(points_m: FloatArray, placement: CameraPlacement) -> FloatArray:
-    """Return the distances of points (..., 2) ahead of the camera."""
-    along = (points_m[..., 0] - placement.x_m) * math.cos(placement.heading_rad)
-    return np.asarray(along + (points_m[..., 1] - placement.y_m) * math.sin(placement.heading_rad))
+def _ends(outlines_m: FloatArray) -> FloatArray:
+    """Return where upright outlines (n, 4, 3) begin and end, (2, 2, n): x and y, each of the beginning and the end."""
+    return np.ascontiguousarray(outlines_m[:, :2, :2].T)
+
+
+def _is_across(points: FloatArray, placement: CameraPlacement) -> NDArray[np.bool_]:
+    """Return for each outline (n, 4, 3) in picture coordinates whether it reaches columns of the picture."""
+    u_px = points[..., 0]
+    return np.asarray((u_px > 0).any(axis=1) & (u_px < placement.model.width_px).any(axis=1))
 
 
 def _clip(corners_m: FloatArray, ahead: FloatArray) -> FloatArray:
@@ -165,6 +172,14 @@ def _clip(corners_m: FloatArray, ahead: FloatArray) -> FloatArray:
             for near_corner, far_corner in ((near, far), (3 - near, 3 - far)):  # the low corners, and the high ones
                 corners_m[cut, near_corner] += share * (corners_m[cut, far_corner] - corners_m[cut, near_corner])
     return corners_m
+
+
+def _project_groups(placement: CameraPlacement, groups_m: Sequence[FloatArray]) -> list[list[NDArray[np.int32]]]:
+    """Return the outlines in subpixels of each group of outlines (n, 4, 3), projected together because it is faster."""
+    if not groups_m:
+        return []
+    outlines = iter(_subpixels(placement.project(np.concatenate(groups_m))))
+    return [list(islice(outlines, len(group))) for group in groups_m]
 
 
 def _subpixels(points: FloatArray) -> NDArray[np.int32]:
