@@ -146,6 +146,12 @@ def test_another_camera_model_is_drawn(road: Road) -> None:
     assert picture.reshape(200, -1).mean(axis=1).min() > 40
 
 
+def test_a_camera_that_sees_no_sky_is_drawn(road: Road) -> None:
+    """The picture of a camera that looks down shows ground in all rows."""
+    picture = picture_of(camera_on(road, model=CameraModel(pitch_rad=1.2)), pose_at(road, 40.0))
+    assert picture.reshape(len(picture), -1).std(axis=1).min() > 1
+
+
 TURNED = CameraModel(x_m=1.2, y_m=0.5, z_m=1.6, pitch_rad=0.1, yaw_rad=0.3, roll_rad=-0.2)
 
 

@@ -302,7 +302,7 @@ class Renderer:
         cv2.subtract(picture, self._negative_noise[part], picture)
 
 
-@lru_cache(maxsize=1)  # the tiles of one road take up to 221 MB
+@lru_cache(maxsize=1)  # the tiles of one road take up to 394 MB
 def world(
     road: Road, scenery: SceneryKind, light_name: LightName, weather_name: WeatherName
 ) -> tuple[Ground, Scenery | None]:
