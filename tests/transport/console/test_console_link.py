@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import http.client
+import itertools
 import json
 import queue
 import socket
@@ -15,19 +16,35 @@ from typing import Any
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import Close
 from websockets.sync.client import ClientConnection, connect
 
-from lavt.channels import CHANNELS
-from lavt.clock import MachineClock
-from lavt.domain import Now
+from lavt.clock import MachineClock, pause
+from lavt.domain import NS_PER_MS, Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
-from lavt.transport.console import console_link, message_limit
+from lavt.transport.console import console_link, message_limit, read_limit
 from lavt.transport.console.console_link import MAX_PAGES, ConsoleLink
-from lavt.transport.console.message_limit import MAX_MESSAGES_PER_S
+from lavt.transport.console.listeners import has_ipv6
 from lavt.transport.console.page_messages import MAX_PAGE_MESSAGE_BYTES, PAGE_VERSION
-from lavt.transport.console.site import HEADERS, NOT_A_HELLO, TOO_MANY_PAGES, WRONG_TOKEN, WRONG_VERSION
+from lavt.transport.console.read_limit import (
+    CONNECTIONS_PER_S,
+    FIRST_READS,
+    MAX_OPENINGS,
+    MAX_READS,
+    MAX_STRANGER_READS,
+    RefillingLimit,
+)
+from lavt.transport.console.site import (
+    HEADERS,
+    NOT_A_HELLO,
+    TOO_MANY_MESSAGES,
+    TOO_MANY_OPENINGS,
+    TOO_MANY_PAGES,
+    WRONG_TOKEN,
+    WRONG_VERSION,
+)
 from lavt.transport.console.strangers import MAX_STRANGER_BYTES, MAX_STRANGERS
 
 TOKEN = "0123456789abcdef"
@@ -35,6 +52,16 @@ HELLO = json.dumps({"type": "hello", "version": PAGE_VERSION, "token": TOKEN})
 KEY = f"Sec-WebSocket-Key: {'A' * 22}=="
 STOP = json.dumps({"type": "stop"})
 PING = bytes([0x89, 0x80 | 125, 0, 0, 0, 0]) + bytes(125)
+LONG = bytes([0x81, 0x80 | 126, *(1000).to_bytes(2, "big"), 0, 0, 0, 0]) + bytes(1000)
+FLOODS = {
+    "pings": PING * MAX_READS,
+    "empty pings": bytes([0x89, 0x80, 0, 0, 0, 0]) * MAX_READS,
+    "pongs": bytes([0x8A, 0x80, 0, 0, 0, 0]) * MAX_READS,
+    "fragments": bytes([0x01, 0x80, 0, 0, 0, 0]) + bytes([0x00, 0x80, 0, 0, 0, 0]) * MAX_READS,
+    "messages": bytes([0x81, 0x80, 0, 0, 0, 0]) * MAX_READS,
+    "long messages": LONG * MAX_READS,
+}
+"""The bytes of many frames of one kind."""
 Delivered = tuple[str, Any, int]
 
 
@@ -156,7 +183,7 @@ def test_the_server_listens_on_loopback_addresses_only(console: Console) -> None
     """The server answers at 127.0.0.1 and, if this machine has it, at ::1, and listens at no other address."""
     addresses = {listener.getsockname()[0] for listener in console.link._sockets}
     assert addresses <= {"127.0.0.1", "::1"}
-    assert ("::1" in addresses) == console_link._has_ipv6()
+    assert ("::1" in addresses) == has_ipv6()
     if "::1" in addresses:
         page = console.connect(host="[::1]", origin=f"http://[::1]:{console.link.port}")
         page.send(HELLO)
@@ -200,20 +227,63 @@ def test_a_huge_message_closes_the_page(console: Console) -> None:
     console.open()[0].close()
 
 
-def test_a_page_that_floods_is_closed(console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A page that sends too much is closed before its messages fill the queue; another page's stop is delivered."""
-    monkeypatch.setattr(message_limit, "MAX_DROPPED_PER_S", 100)
+@pytest.mark.parametrize("frames", FLOODS.values(), ids=FLOODS)
+def test_a_page_that_floods_is_closed(console: Console, frames: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page that sends too many frames of any kind is closed with a reason; another page's stop is delivered."""
+    monkeypatch.setattr(read_limit, "READS_PER_S", 0)
     (page, number), (other, other_number) = console.open(), console.open()
-    with suppress(ConnectionClosed):
-        for _ in range(MAX_MESSAGES_PER_S * 20):
-            page.send("flood")
+    with suppress(OSError):  # the console reads only a part
+        page.socket.sendall(frames * 10)
+    with pytest.raises(ConnectionClosed) as raised:
+        page.recv(timeout=10)  # nothing was sent to the page
+    assert raised.value.rcvd == Close(*TOO_MANY_MESSAGES)
     other.send("stop")
     delivered: list[Delivered] = []
     while {("page_closed", None, number), ("page_message", "stop", other_number)} - set(delivered):
         delivered.append(console.take())
-    assert len(delivered) < CHANNELS["page_message"].length
-    assert console.link.counts["pages_too_busy"] == 1
+    assert len(delivered) <= FIRST_READS + 2
+    assert console.link.counts["connections_too_busy"] == 1
     other.close()
+
+
+def test_a_page_that_sends_single_bytes_is_closed(console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page whose message arrives byte by byte costs a read for each byte, and is closed."""
+    monkeypatch.setattr(read_limit, "READS_PER_S", 0)
+    page, number = console.open()
+    page.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    with suppress(OSError):
+        for byte in itertools.cycle(LONG):
+            page.socket.send(bytes([byte]))
+            pause(NS_PER_MS)  # a read for each byte
+    while console.take() != ("page_closed", None, number):
+        pass
+    assert console.link.counts["connections_too_busy"] == 1
+
+
+def test_a_page_that_is_closed_cannot_go_on_in_new_pages(console: Console) -> None:
+    """The openings of pages are limited, whoever makes them; a page that is open stays so."""
+    page, number = console.open()
+    for _ in range(MAX_OPENINGS - 1):
+        console.open()[0].close()
+        assert console.take()[0] == "page_closed"
+    assert console.closing_code(HELLO) == TOO_MANY_OPENINGS.code
+    page.send("a message")
+    assert console.take() == ("page_message", "a message", number)
+    page.close()
+
+
+def test_too_many_connections_wait_unaccepted(console: Console, caplog: pytest.LogCaptureFixture) -> None:
+    """Above the limit, connections wait in the kernel and cost nothing; later ones are served again; nobody is told."""
+    console.link._connection_limit = RefillingLimit(CONNECTIONS_PER_S, CONNECTIONS_PER_S)
+    page, number = console.open()
+    for _ in range(4 * CONNECTIONS_PER_S):
+        socket.create_connection(("127.0.0.1", console.link.port), timeout=10).close()
+    page.send("a message")
+    assert console.take() == ("page_message", "a message", number)
+    assert get(console.link.port, "/")[0] == 200
+    assert 1 <= console.link.counts["accepts_paused"] <= 5
+    assert caplog.records == []
+    page.close()
 
 
 def test_a_stop_behind_too_many_messages_is_delivered(console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,9 +369,21 @@ def test_a_flood_without_the_token_is_not_read(console: Console) -> None:
     assert console.link.counts["connections_too_long"] == 1
 
 
+def test_frames_without_the_token_are_few(console: Console) -> None:
+    """A connection without the token that sends many small frames is closed after a few, with few bytes."""
+    with open_socket(console.link.port) as sock:
+        sock.sendall(bytes([0x89, 0x80, 0, 0, 0, 0]) * MAX_STRANGER_READS)
+        with suppress(ConnectionError):
+            while sock.recv(4096):
+                pass
+    assert console.link.counts["connections_too_busy"] == 1
+
+
 def test_a_page_that_reads_no_answers_is_closed(console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
     """A page that sends pings and reads no answers is closed before its answers fill the memory."""
     monkeypatch.setattr(console_link, "MAX_UNSENT_BYTES", 2**16)
+    monkeypatch.setattr(read_limit, "FIRST_READS", 10**6)
+    monkeypatch.setattr(read_limit, "MAX_READS", 10**6)
     with open_socket(console.link.port) as sock:
         hello = HELLO.encode()
         sock.sendall(bytes([0x81, 0x80 | len(hello), 0, 0, 0, 0]) + hello)

@@ -21,12 +21,22 @@ from lavt.clock import Clock
 from lavt.domain import Now
 from lavt.errors import UserError, WorkError
 from lavt.node import Send
-from lavt.transport.console.message_limit import MessageLimit, Verdict
+from lavt.transport.console.listeners import ignore_paused_accepts, open_listeners
+from lavt.transport.console.message_limit import MessageLimit
 from lavt.transport.console.page_messages import MAX_PAGE_MESSAGE_BYTES
+from lavt.transport.console.read_limit import (
+    CONNECTIONS_PER_S,
+    MAX_CONNECTIONS,
+    MAX_OPENINGS,
+    OPENINGS_PER_S,
+    ReadLimits,
+    RefillingLimit,
+)
 from lavt.transport.console.site import (
     HEADERS,
     PAGE_FILES,
     TOO_MANY_MESSAGES,
+    TOO_MANY_OPENINGS,
     TOO_MANY_PAGES,
     ConsoleSite,
     page_headers,
@@ -35,6 +45,7 @@ from lavt.transport.console.strangers import Strangers
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
+    from websockets.frames import Frame
     from websockets.http11 import Request, Response
 
 Deliver = Callable[[str, Any, Now, Any], None]
@@ -49,7 +60,6 @@ MAX_UNSENT_BYTES: Final = 8 * 2**20
 of a page that may be on the way are smaller."""
 HELLO_TIMEOUT_S: Final = 5.0
 CLOSE_TIMEOUT_S: Final = 1.0
-PORT_ATTEMPTS: Final = 10
 MISSING: Final = "the console is a web page, which needs the package websockets: pip install -e '.[console]'"
 
 
@@ -84,7 +94,10 @@ class ConsoleLink:
         self.counts: Counter[str] = Counter()
         self._websockets = _import_websockets()
         self._clock = clock
-        self._sockets = _open_sockets(port)
+        self._connection_limit = RefillingLimit(CONNECTIONS_PER_S, MAX_CONNECTIONS)
+        self._opening_limit = RefillingLimit(OPENINGS_PER_S, MAX_OPENINGS)
+        self._read_limits = ReadLimits()
+        self._sockets = open_listeners(port, self._may_accept)
         self.port: int = self._sockets[0].getsockname()[1]
         self.url = f"http://127.0.0.1:{self.port}/#{token}"
         self._site = ConsoleSite(self.port, token, folder)
@@ -139,7 +152,15 @@ class ConsoleLink:
         if not self._closing:
             raise WorkError("the web server of the console has ended")
 
+    def _may_accept(self) -> bool:
+        """Return whether one more connection may be accepted now."""
+        if self._connection_limit.take(self._clock.now().mono_ns):
+            return True
+        self.counts["accepts_paused"] += 1
+        return False
+
     async def _serve(self, deliver: Deliver) -> None:
+        self._loop.set_exception_handler(ignore_paused_accepts)
         servers = [await self._start_server(listener, deliver) for listener in self._sockets]
         try:
             await self._ends
@@ -154,7 +175,7 @@ class ConsoleLink:
         server: Server = await self._websockets.asyncio.server.serve(
             lambda connection: self._guard(connection, deliver),
             sock=listener,
-            create_connection=_limited_connection(self._strangers, self.counts),
+            create_connection=_limited_connection(self._clock, self._strangers, self._read_limits, self.counts),
             process_request=self._process_request,
             compression=None,
             max_size=self._max_message_bytes,
@@ -199,11 +220,14 @@ class ConsoleLink:
         closing = self._site.reject_hello(hello)
         if closing is None and len(self._pages) >= MAX_PAGES:
             closing = TOO_MANY_PAGES
+        if closing is None and not self._opening_limit.take(self._clock.now().mono_ns):
+            closing = TOO_MANY_OPENINGS
         if closing is not None:
             self.counts["pages_rejected"] += 1
             await connection.close(*closing)
             return
         self._strangers.remove(connection)
+        self._read_limits.admit(connection)
         number, page = next(self._numbers), _Page(connection)
         self._pages[number] = page
         writer = asyncio.create_task(self._write(page))
@@ -211,15 +235,10 @@ class ConsoleLink:
             deliver(f"{self._prefix}_opened", None, self._clock.now(), number)
             async for message in connection:
                 now = self._clock.now()
-                verdict = page.limit.judge(message, now.mono_ns)
-                if verdict is Verdict.CLOSE:
-                    self.counts["pages_too_busy"] += 1
-                    await connection.close(*TOO_MANY_MESSAGES)
-                    return
-                if verdict is Verdict.DROP:
-                    self.counts["page_messages_too_many"] += 1
-                else:
+                if page.limit.allows(message, now.mono_ns):
                     deliver(f"{self._prefix}_message", message, now, number)
+                else:
+                    self.counts["page_messages_too_many"] += 1
         finally:
             del self._pages[number]
             writer.cancel()
@@ -247,37 +266,64 @@ class ConsoleLink:
             self._end(error)
 
 
-def _limited_connection(strangers: Strangers, counts: Counter[str]) -> type[ServerConnection]:
-    """Return the class of connections that are limited in number before the token, and in what waits to be sent.
+def _limited_connection(
+    clock: Clock, strangers: Strangers, read_limits: ReadLimits, counts: Counter[str]
+) -> type[ServerConnection]:
+    """Return the class of connections that are limited in what they send, and in what waits to be sent to them.
 
     Their own errors, as for a request that is no valid HTTP, have the headers of the site.
     """
     from websockets.asyncio.server import ServerConnection  # noqa: PLC0415 (an optional package)
 
     class LimitedConnection(ServerConnection):
+        is_over = False
+        """It has sent too much, and nothing of it is read any more."""
+
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
             super().connection_made(transport)
-            reject = self.protocol.reject
+            reject, receive_frame = self.protocol.reject, self.protocol.recv_frame
 
             def reject_with_headers(status: HTTPStatus | int, text: str) -> Response:
                 response = reject(status, text)
                 response.headers.update(HEADERS)
                 return response
 
+            def receive_limited(frame: Frame) -> None:
+                """Process a frame; above the limit, close the connection, which discards the frames after it."""
+                if read_limits.take(self, clock.now().mono_ns):
+                    receive_frame(frame)
+                elif not self.is_over:
+                    self.end()
+
             self.protocol.reject = reject_with_headers  # type: ignore[method-assign]
+            self.protocol.recv_frame = receive_limited  # type: ignore[method-assign]
             strangers.add(self, self.transport.abort)
+            read_limits.add(self)
 
         def connection_lost(self, exc: Exception | None) -> None:
             strangers.remove(self)
+            read_limits.remove(self)
             super().connection_lost(exc)
 
         def data_received(self, data: bytes) -> None:
-            if not strangers.may_read(self, len(data)):
+            if self.is_over or not strangers.may_read(self, len(data)):
+                return
+            if not read_limits.take(self, clock.now().mono_ns):
+                self.end()
+                self.send_data()
                 return
             super().data_received(data)
             if self.transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
                 counts["connections_not_reading"] += 1
                 self.transport.abort()
+
+        def end(self) -> None:
+            """Tell the page why it is closed, and read nothing more; it has a second to take this."""
+            self.is_over = True
+            counts["connections_too_busy"] += 1
+            self.protocol.fail(*TOO_MANY_MESSAGES)
+            self.transport.pause_reading()
+            self.loop.call_later(CLOSE_TIMEOUT_S, self.transport.abort)
 
     return LimitedConnection
 
@@ -308,51 +354,3 @@ async def _cancel_tasks() -> None:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
-
-
-def _open_sockets(port: int) -> list[socket.socket]:
-    """Return listening sockets at 127.0.0.1 and ::1 with the same port; without IPv6, only the first.
-
-    Both are needed: another program at the port of ::1 would get what a browser sends to `localhost`.
-    """
-    for attempt in range(PORT_ATTEMPTS):
-        is_last = port != 0 or attempt == PORT_ATTEMPTS - 1
-        first = _listen(socket.AF_INET, "127.0.0.1", port)
-        if isinstance(first, OSError):
-            raise UserError(f"the console's port {port} cannot be opened ({first.strerror}): choose another, or 0")
-        number = first.getsockname()[1]
-        second = _listen(socket.AF_INET6, "::1", number)
-        if not isinstance(second, OSError):
-            return [first, second]
-        if not _has_ipv6():
-            return [first]
-        first.close()
-        if is_last:
-            raise UserError(f"the console's port {number} is used at ::1 ({second.strerror}): choose another, or 0")
-    raise AssertionError
-
-
-def _listen(family: socket.AddressFamily, host: str, port: int) -> socket.socket | OSError:
-    try:
-        listener = socket.socket(family, socket.SOCK_STREAM)
-    except OSError as error:
-        return error
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if family == socket.AF_INET6:
-            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        listener.bind((host, port))
-        listener.listen()
-    except OSError as error:
-        listener.close()
-        return error
-    return listener
-
-
-def _has_ipv6() -> bool:
-    """Return whether this machine has the address ::1."""
-    probe = _listen(socket.AF_INET6, "::1", 0)
-    if isinstance(probe, OSError):
-        return False
-    probe.close()
-    return True

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import Enum, auto
 from typing import Final
 
 from lavt.domain import NS_PER_S
@@ -10,19 +9,9 @@ from lavt.transport.console.page_messages import is_stop
 
 MAX_MESSAGES_PER_S: Final = 400
 """Further messages of a page in the same second are dropped. A page sends 50 inputs and two messages for each picture
-in a second, and what it could not send before."""
+in a second, and what it could not send before. `read_limit.py` limits what it costs to read them."""
 MAX_STOPS_PER_S: Final = 20
 """Emergency stops are delivered also above the limit, up to this number; a page sends two in a second."""
-MAX_DROPPED_PER_S: Final = 10 * MAX_MESSAGES_PER_S
-"""A page from which more would be dropped is closed: reading them delays the messages of others."""
-
-
-class Verdict(Enum):
-    """What to do with a message."""
-
-    DELIVER = auto()
-    DROP = auto()
-    CLOSE = auto()
 
 
 class MessageLimit:
@@ -33,15 +22,15 @@ class MessageLimit:
         self._received = 0
         self._stops = 0
 
-    def judge(self, message: str | bytes, now_ns: int) -> Verdict:
-        """Return what to do with a message that arrives now. An emergency stop behind too many others is delivered."""
+    def allows(self, message: str | bytes, now_ns: int) -> bool:
+        """Return whether to deliver a message that arrives now. An emergency stop behind too many others is."""
         second = now_ns // NS_PER_S
         if second != self._second:
             self._second, self._received, self._stops = second, 0, 0
         self._received += 1
         if self._received <= MAX_MESSAGES_PER_S:
-            return Verdict.DELIVER
+            return True
         if self._stops < MAX_STOPS_PER_S and is_stop(message):
             self._stops += 1
-            return Verdict.DELIVER
-        return Verdict.DROP if self._received <= MAX_MESSAGES_PER_S + MAX_DROPPED_PER_S else Verdict.CLOSE
+            return True
+        return False

@@ -58,7 +58,8 @@ WRONG_TOKEN: Final = Closing(4401, "wrong token: open the address that lavt has 
 WRONG_VERSION: Final = Closing(4426, "this page is of another version of lavt: reload it")
 NOT_A_HELLO: Final = Closing(4400, "not a page of lavt")
 TOO_MANY_PAGES: Final = Closing(4429, "too many pages are open: close one")
-TOO_MANY_MESSAGES: Final = Closing(4408, "this page has sent too many messages: reload it")
+TOO_MANY_OPENINGS: Final = Closing(4430, "too many pages have connected just now: this one tries again")
+TOO_MANY_MESSAGES: Final = Closing(4408, "this page has sent too much: it was closed, and connects again")
 
 
 class ConsoleSite:
