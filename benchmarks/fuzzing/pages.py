@@ -132,7 +132,7 @@ class DrivingPages:
         if self._inputs_since_end >= INPUTS_AFTER_END:
             self._restart()
         page, message = 1 + chance.below(2), as_received(data, chance)
-        self._limits[page].judge(message, self._bench.now.mono_ns)
+        self._limits[page].allows(message, self._bench.now.mono_ns)
         if page == 1 and as_object(message).get("held") is True:
             self._held_ns = self._bench.now.mono_ns  # perhaps: a damaged input may be invalid
         self._is_stopped |= as_object(message).get("type") == "stop"
