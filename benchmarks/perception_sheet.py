@@ -33,6 +33,8 @@ ERROR_LIMIT_M = 0.5
 CONFIDENCE_BINS = (0.0, 0.05, 0.2, 0.3, 0.4, 0.6, 0.8, 1.001)
 UNDECIDED = "yellow diversion"
 """The kind of picture whose true lane is ambiguous; it is excluded from the table by confidence."""
+TILE_PX = (400, 300)
+"""Size of a step on the drawn sheet."""
 PICTURED_KINDS = ("as it is", "h264 200 kbit/s", "tree shadows", "old yellow line", "glare", "coarse blocks")
 """The kinds of pictures on the drawn sheet."""
 
@@ -141,7 +143,8 @@ def draw_sheet(sheet_cases: Iterable[DegradedCase]) -> Picture:
     parts = []
     for case in sheet_cases:
         detector = LaneDetector(MODEL)
-        drawn = draw_panel(calibrated_pinhole_camera(MODEL), detector, case.picture)
+        lane = detector.detect(case.picture)
+        drawn = draw_panel(calibrated_pinhole_camera(MODEL), detector, case.picture, lane, TILE_PX)
         title = np.full((34, drawn.shape[1], 3), 90, dtype=np.uint8)
         cv2.putText(title, case.kind, (10, 25), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (255, 255, 255), 2, cv2.LINE_AA)
         parts += [title, drawn]

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import csv
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from tests.perception.conftest import Line, Scene
 
 from lavt.assembly.cameras import camera_of_file
 from lavt.assembly.entropy import MachineEntropy
@@ -57,9 +60,63 @@ def test_the_steps_of_a_picture_are_drawn(show: Show) -> None:
     show("road.png")
     steps = cv2.imread("road-steps.png")
     assert steps is not None
-    rows, columns, height_px, width_px = 3, 4, 324, 400
+    rows, columns, height_px, width_px = 3, 4, 518, 640
     assert steps.shape == (rows * height_px, columns * width_px, 3)
-    assert steps[:24].max() > 200  # the labels
+    assert steps[:38].max() > 200  # the labels
+
+
+def test_the_size_of_the_steps_can_be_chosen(show: Show) -> None:
+    """With `--tile-width-px 200` each step is 200 x 150 pixels, below its label."""
+    show("road.png", "--tile-width-px", "200")
+    steps = cv2.imread("road-steps.png")
+    assert steps is not None
+    assert steps.shape == (3 * (150 + 12), 4 * 200, 3)
+
+
+def test_several_sources_give_a_drawing_and_a_row_for_each(show: Show, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of pictures, videos and directories, each file is drawn, and each picture has a row in the CSV file."""
+    Path("more").mkdir()
+    lane = Scene(CameraModel()).render()
+    cv2.imwrite("more/road.png", lane)
+    write_video(Path("more/drive.mp4"), [lane] * 3, 30.0)
+    Path("more/notes.txt").touch()
+    show("road.png", "more", "--csv", "rows.csv", camera=str(shipped("configs/demo.yaml")))
+    drawn = {file.name for file in Path("perception-steps").iterdir()}
+    assert drawn == {"road-steps.png", "road-2-steps.png", "drive-steps.mp4"}
+    with Path("rows.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row["source"], row["picture"]) for row in rows] == [
+        ("road.png", "0"), *(("more/drive.mp4", str(number)) for number in range(3)), ("more/road.png", "0")
+    ]  # fmt: skip
+    empty, first, second, _, picture = rows
+    assert (empty["followed"], empty["centre_m"], empty["confidence"]) == ("false", "", "0.0")
+    assert (first["searched"], second["searched"], picture["searched"]) == ("true", "false", "true")
+    assert abs(float(picture["centre_m"])) < 0.05
+    assert float(picture["width_m"]) == pytest.approx(3.5, abs=0.05)
+    printed = capsys.readouterr().out
+    assert "drive.mp4: 3 pictures, 3 with a lane (100 %)" in printed
+    assert "road.png: confidence 0.00, no lane" in printed
+
+
+def test_the_rows_are_printed_as_json(show: Show, capsys: pytest.CaptureFixture[str]) -> None:
+    """With `--json`, the only output is a list of one object for each picture; `--no-draw` draws nothing."""
+    show("road.png", "road.png", "--json", "--no-draw")
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["source"] for row in rows] == ["road.png"] * 2
+    assert all(row["confidence"] == 0 and row["followed"] is False and row["width_m"] is None for row in rows)
+    assert {path.name for path in Path().iterdir()} == {"camera.yaml", "road.png"}
+
+
+@pytest.mark.parametrize(("lane_confidence", "followed"), [("0.9", True), ("0.95", False)])
+def test_the_threshold_of_a_followed_lane_can_be_chosen(
+    show: Show, capsys: pytest.CaptureFixture[str], lane_confidence: str, *, followed: bool
+) -> None:
+    """A lane counts as followed from the confidence `--lane-confidence` on."""
+    cv2.imwrite("lane.png", Scene(CameraModel()).render((Line(1.75), Line(-1.75, dash_m=3.0))))
+    demo = str(shipped("configs/demo.yaml"))
+    show("lane.png", "--json", "--no-draw", "--lane-confidence", lane_confidence, camera=demo)
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["followed"] is followed, row["confidence"]
 
 
 @pytest.mark.parametrize("name", ["demo.yaml", "client.yaml", "sweep.yaml"])
@@ -82,7 +139,10 @@ def test_the_steps_of_a_video_are_a_video(show: Show) -> None:
     ("source", "calibration", "options", "reason"),
     [
         ("nothing.png", CALIBRATION, (), "nothing.png"),
-        (".", CALIBRATION, (), ". does not exist"),
+        ("empty_directory", CALIBRATION, (), "has no picture, video or record"),
+        (".", CALIBRATION, ("--out", "road.png"), "road.png is a file"),
+        ("road.png", CALIBRATION, ("--csv", "nowhere/rows.csv"), "nowhere is not a directory"),
+        ("road.png", CALIBRATION, ("--detector", "eyes"), "there is no detector 'eyes'; choose one of"),
         ("camera.yaml", CALIBRATION, (), "camera.yaml"),
         ("empty.mp4", CALIBRATION, (), "empty.mp4"),
         ("record.mcap", CALIBRATION, (), "has no picture"),
@@ -108,6 +168,7 @@ def test_bad_input(show: Show, source: str, calibration: str, options: tuple[str
     """Unusable sources, calibrations and outputs are rejected with the reason, and nothing is written."""
     Path("camera.yaml").write_text(calibration)
     Path("empty.mp4").touch()
+    Path("empty_directory").mkdir()
     Path("record.mcap").touch()
     cv2.imwrite("small.png", ROAD[::2, ::2])
     with pytest.raises(UserError) as raised:

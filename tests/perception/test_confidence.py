@@ -10,7 +10,8 @@ from benchmarks.degraded import AT_10_M, MODEL, NO_LANE, blocks, cases
 from benchmarks.perception_sheet import UNDECIDED, LaneVerdict, check_case, kinds_table, reliability_table
 
 from lavt.control.lane_watch import LANE_CONFIDENCE
-from lavt.perception.lane_detector import TRACK_CONFIDENCE, LaneDetector
+from lavt.perception.detection import TRACK_CONFIDENCE
+from lavt.perception.lane_detector import LaneDetector
 from lavt.streams import stream
 
 CLEAR_LANE_KINDS = (

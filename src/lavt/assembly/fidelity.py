@@ -6,10 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from lavt.assembly.cameras import client_camera
+from lavt.assembly.detection.detectors import build_detector
 from lavt.assembly.vehicles import VehicleSetup, build_geometry_setup, build_vehicle_setup
 from lavt.config import ClientConfig, ServerConfig
 from lavt.nodes.driver import LaneDetection
-from lavt.perception.lane_detector import TRACK_CONFIDENCE, GroundTruthLaneDetector, LaneDetector
+from lavt.perception.detection import TRACK_CONFIDENCE, DetectorSettings, PictureDetector
+from lavt.perception.lane_detector import GroundTruthLaneDetector
 from lavt.transport.video.frame_codec import (
     InMemoryFrameCodec,
     LaneReceiver,
@@ -58,8 +60,9 @@ def _track_confidence(config: ClientConfig) -> float:
     return min(TRACK_CONFIDENCE, config.controller.effective_preset().lane_confidence)
 
 
-def _lane_detector(config: ClientConfig) -> LaneDetector:
-    return LaneDetector(client_camera(config.camera), track_confidence=_track_confidence(config))
+def _lane_detector(config: ClientConfig) -> PictureDetector:
+    settings = DetectorSettings(track_confidence=_track_confidence(config), file=config.perception.file)
+    return build_detector(config.perception.detector, client_camera(config.camera), settings)
 
 
 def _ground_truth_detector(config: ClientConfig) -> GroundTruthLaneDetector:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,8 @@ from lavt.transport.video.h264 import Decoder
 from lavt.transport.video.video_file import VIDEO_CODECS
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
+SOURCE_SUFFIXES = (*PICTURE_SUFFIXES, ".mp4", ".mkv", ".avi", ".mov", ".mcap")
+"""The names of files that are read in a directory."""
 DEFAULT_RATE_HZ = 30.0
 """The picture rate of a video whose file states no plausible rate."""
 
@@ -28,6 +30,29 @@ class PictureFile:
     pictures: Iterator[Picture]
     is_video: bool
     rate_hz: float = DEFAULT_RATE_HZ
+
+
+def find_sources(paths: Sequence[Path]) -> list[Path]:
+    """Return the files, and for each directory the pictures, videos and records in it, sorted by name.
+
+    Raises `UserError` if a path does not exist, or if a directory has no such file.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            files.append(path)
+            continue
+        found = sorted(file for file in path.iterdir() if file.suffix.lower() in SOURCE_SUFFIXES and file.is_file())
+        if not found:
+            raise UserError(
+                f"the directory {path} has no picture, video or record ({', '.join(SOURCE_SUFFIXES)}): name another "
+                "directory, or files"
+            )
+        files += found
+    missing = [file for file in files if not file.exists()]
+    if missing:
+        raise UserError(f"{missing[0]} does not exist: name a picture, a video, a record or a directory of them")
+    return files
 
 
 def read_pictures(path: Path) -> PictureFile:

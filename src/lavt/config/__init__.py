@@ -25,6 +25,7 @@ from lavt.config.injection import ImpairmentConfig as ImpairmentConfig
 from lavt.config.injection import InjectionConfig as InjectionConfig
 from lavt.config.injection import LinkConfig as LinkConfig
 from lavt.config.injection import ServerInjectionConfig as ServerInjectionConfig
+from lavt.config.perception import PerceptionConfig as PerceptionConfig
 from lavt.config.relay import DelayConfig as DelayConfig
 from lavt.config.relay import RelayConfig as RelayConfig
 from lavt.config.rendezvous import RendezvousConfig as RendezvousConfig
@@ -146,6 +147,7 @@ class RunConfig(Section):
 
     vehicle: VehicleConfig = VehicleConfig()
     controller: ControllerConfig = ControllerConfig()
+    perception: PerceptionConfig = PerceptionConfig()
     camera: CameraConfig = CameraConfig()
     video: VideoConfig = VideoConfig()
     network: NetworkConfig = NetworkConfig()
@@ -357,6 +359,7 @@ class ClientConfig(Section):
     take_over: bool = False
     """Whether to request a handover from the client in control, see `docs/session.md`."""
     controller: ControllerConfig = ControllerConfig()
+    perception: PerceptionConfig = PerceptionConfig()
     console: ConsoleConfig = ConsoleConfig()
     camera: ClientCameraConfig = ClientCameraConfig()
     video: ClientVideoConfig = ClientVideoConfig()

@@ -9,8 +9,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from lavt.domain import NS_PER_MS, CameraModel, Lane, Picture, SeenLane
+from lavt.errors import UserError
 from lavt.perception.bird_eye import GroundGrid, make_bird_eye
 from lavt.perception.calibration import CalibratedCamera, calibrated_pinhole_camera
+from lavt.perception.detection import LANE_WIDTH_M, TRACK_CONFIDENCE, PaintFinder
 from lavt.perception.lane_fit import OUTLIER_M, LaneFit, Points, Sides, fit_lane, mark_points, sides_near
 from lavt.perception.lane_paint import Mask, lane_paint
 from lavt.perception.lane_search import has_parallel, sides_by_windows, start_lanes
@@ -19,10 +21,6 @@ SMOOTHING = 0.6
 """Weight of the newest picture in the moving average; `lavt.experiment.boundary.delay_margin` depends on it."""
 GRID = GroundGrid()
 """The ground searched for the lane."""
-LANE_WIDTH_M = 3.5
-"""The lane's width until it has been measured."""
-TRACK_CONFIDENCE = 0.2
-"""By default a lane with less confidence is not tracked. One line that is visible over 40 % of the length gives 0.2."""
 MIN_CLEARNESS = 0.35
 """A search finds no lane with less clearness (`LaneFit.clearness`): there is no earlier picture that supports it."""
 START_LANES = 3
@@ -63,6 +61,11 @@ class DetectionTrace:
     fit: LaneFit | None
     """The lane in this picture alone; None if there is none."""
 
+    @property
+    def is_search(self) -> bool:
+        """Whether the lane was searched, and not tracked from the last picture."""
+        return bool(self.windows) or self.expected is None
+
 
 class LaneDetector:
     """A lane detector that searches with sliding windows at first, then tracks the lane, and averages over pictures.
@@ -70,7 +73,8 @@ class LaneDetector:
     Confidence is (visible share of the left line + visible share of the right line) / 2 x (share of the paint in and
     beside the lane that is on its lines, scaled to 0 for speckle and 1 for clean lines). A line is visible where it has
     paint, and 3 m before and behind. Confidence refers to the newest picture alone: without a lane in it the confidence
-    is 0 and the lane is the last one detected. docs/perception.md lists the values to expect.
+    is 0 and the lane is the last one detected. docs/perception.md lists the values to expect. `paint_finder` replaces
+    LAVT's own test for paint.
     """
 
     def __init__(
@@ -81,6 +85,7 @@ class LaneDetector:
         *,
         stamped: bool = True,
         track_confidence: float = TRACK_CONFIDENCE,
+        paint_finder: PaintFinder | None = None,
     ) -> None:
         calibration = calibrated_pinhole_camera(camera) if isinstance(camera, CameraModel) else camera
         self._shape = (calibration.height_px, calibration.width_px, 3)
@@ -88,8 +93,14 @@ class LaneDetector:
         self.trace: DetectionTrace | None = None
         self._lane_width_m = lane_width_m
         self._track_confidence = track_confidence
+        self._paint_finder = paint_finder
         self._lane = Lane((0.0, 0.0, 0.0), lane_width_m, grid.near_m, grid.far_m, 0.0)
         self._misses = FORGET_AFTER_PICTURES
+
+    @property
+    def finds_paint_itself(self) -> bool:
+        """Whether LAVT's own test for paint is used."""
+        return self._paint_finder is None
 
     def forget(self) -> None:
         """Search the next picture for the lane that contains the car, instead of tracking the last lane."""
@@ -99,8 +110,7 @@ class LaneDetector:
         """Return the lane in the next picture; raise `ValueError` unless its shape is the camera's, (h, w, 3)."""
         if picture_bgr.shape != self._shape:
             raise ValueError(f"the picture has the shape {picture_bgr.shape}, not {self._shape}")
-        view = self.bird_eye.view_from_above(self.bird_eye.region(picture_bgr))
-        mask = lane_paint(view, self.bird_eye.grid)
+        mask = self._paint(picture_bgr)
         points = mark_points(mask, self.bird_eye.grid)
         tracked = self._misses < FORGET_AFTER_PICTURES
         self.trace = self._track(mask, points) if tracked else self._search(mask, points)
@@ -114,6 +124,19 @@ class LaneDetector:
             if car_has_left(self._lane):
                 self.forget()
         return self._lane
+
+    def _paint(self, picture_bgr: Picture) -> Mask:
+        """Return the mask of paint in the view from above; raise `UserError` for a mask that is not the picture's."""
+        bird_eye = self.bird_eye
+        if self._paint_finder is None:
+            return lane_paint(bird_eye.view_from_above(bird_eye.region(picture_bgr)), bird_eye.grid)
+        paint = self._paint_finder.find_paint(picture_bgr)
+        if paint.shape != picture_bgr.shape[:2] or paint.dtype != np.uint8:
+            raise UserError(
+                f"{type(self._paint_finder).__name__} made a mask of {paint.dtype} with the shape {paint.shape}, but "
+                f"LAVT needs uint8 and the shape of the picture, {picture_bgr.shape[:2]}: correct its find_paint"
+            )
+        return bird_eye.view_from_above(bird_eye.region(paint))
 
     def _track(self, mask: Mask, points: Points) -> DetectionTrace:
         sides = sides_near(points, self._lane.centre, self._lane.width_m)

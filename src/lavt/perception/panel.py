@@ -11,55 +11,84 @@ import numpy as np
 from lavt.domain import FloatArray, Lane, Picture
 from lavt.perception.bird_eye import BirdEye, GroundGrid
 from lavt.perception.calibration import CalibratedCamera, ground_to_picture, picture_points
-from lavt.perception.lane_detector import TRACK_CONFIDENCE, DetectionTrace, LaneDetector
+from lavt.perception.detection import TRACK_CONFIDENCE, PictureDetector
+from lavt.perception.lane_detector import DetectionTrace, LaneDetector
 from lavt.perception.lane_fit import CORRIDOR_M
 from lavt.perception.lane_paint import brightness_of, white_paint, yellow_paint, yellowness_of
 from lavt.perception.lane_search import WINDOW_M
 
-TILE_PX = (400, 300)
+TILE_PX = (640, 480)
 """Width and height of a step's tile, below a line of text."""
+TEXT_WIDTH_PX = 400
+"""The width of a tile for which text is drawn at its smallest size; it grows with the tile."""
 LABEL_PX = 24
 COLUMNS = 4
 LEFT, RIGHT, OTHER, CENTRE, EXPECTED = (80, 200, 80), (230, 150, 60), (120, 120, 120), (60, 60, 255), (60, 220, 255)
 """Colours (blue, green, red) of the left and right line's points, other points, the centre, and the expected lines."""
 
 
-def draw_panel(camera: CalibratedCamera, detector: LaneDetector, picture: Picture) -> Picture:
-    """Detect the lane in the next picture and return a drawing of the steps: 3 rows and 4 columns of tiles."""
-    lane = detector.detect(picture)
-    trace, bird_eye = detector.trace, detector.bird_eye
-    if trace is None:
-        raise ValueError("a detector has a trace after detecting")
-    view = bird_eye.view_from_above(bird_eye.region(picture))
-    tiles = {
-        "1 picture": picture,
-        "2 undistorted, with the searched ground": _draw_ground_outline(camera, picture, bird_eye.grid),
-        "3 bird's-eye view, far end at the top": view,
-        "4 brightness": _grey_to_colour(brightness_of(view)),
-        "5 white: brighter than both sides": _grey_to_colour(white_paint(view, bird_eye.grid)),
-        "6 yellowness": _grey_to_colour(yellowness_of(view)),
-        "7 yellow: yellower than both sides": _grey_to_colour(yellow_paint(view, bird_eye.grid)),
-        "8 paint: 5 or 7, without specks": _grey_to_colour(trace.mask),
-        "9 points: left, right, other": _draw_points(trace, bird_eye.grid),
-        "10 fitted lane": _draw_fit(trace, lane, bird_eye),
-        "11 lane in the picture": draw_lane(camera, picture, lane),
-    }
-    drawn = [_make_tile(label, tile) for label, tile in tiles.items()]
-    drawn.append(_make_tile("12 confidence", _confidence_text(trace, lane)))
-    return np.vstack([np.hstack(drawn[start : start + COLUMNS]) for start in range(0, len(drawn), COLUMNS)])
+def draw_panel(
+    camera: CalibratedCamera,
+    detector: PictureDetector,
+    picture: Picture,
+    lane: Lane,
+    tile_px: tuple[int, int] = TILE_PX,
+    *,
+    lane_confidence: float = TRACK_CONFIDENCE,
+) -> Picture:
+    """Return a drawing of the steps by which a detector just found a lane: up to 3 rows and 4 columns of tiles.
+
+    A lane with less than `lane_confidence` counts as none.
+
+    Of a detector that is not LAVT's own, only the picture and the lane are known.
+    """
+    trace = detector.trace if isinstance(detector, LaneDetector) else None
+    tiles = {"picture": picture}
+    if isinstance(detector, LaneDetector) and trace is not None:
+        bird_eye = detector.bird_eye
+        view = bird_eye.view_from_above(bird_eye.region(picture))
+        tiles["undistorted, with the searched ground"] = _draw_ground_outline(camera, picture, bird_eye.grid)
+        tiles["bird's-eye view, far end at the top"] = view
+        if detector.finds_paint_itself:
+            tiles |= {
+                "brightness": _grey_to_colour(brightness_of(view)),
+                "white: brighter than both sides": _grey_to_colour(white_paint(view, bird_eye.grid)),
+                "yellowness": _grey_to_colour(yellowness_of(view)),
+                "yellow: yellower than both sides": _grey_to_colour(yellow_paint(view, bird_eye.grid)),
+            }
+        tiles |= {
+            "paint": _grey_to_colour(trace.mask),
+            "points: left, right, other": _draw_points(trace, bird_eye.grid),
+            "fitted lane": _draw_fit(trace, lane, bird_eye),
+        }
+    tiles["lane in the picture"] = draw_lane(camera, picture, lane, lane_confidence)
+    tiles["confidence"] = _confidence_text(trace, lane, tile_px, lane_confidence)
+    drawn = [_make_tile(f"{number} {label}", tile, tile_px) for number, (label, tile) in enumerate(tiles.items(), 1)]
+    columns = min(COLUMNS, len(drawn))
+    drawn += [np.zeros_like(drawn[0])] * (-len(drawn) % columns)
+    return np.vstack([np.hstack(drawn[start : start + columns]) for start in range(0, len(drawn), columns)])
 
 
-def _make_tile(label: str, tile: Picture) -> Picture:
+def _write(drawn: Picture, text: str, at_px: tuple[int, int], colour: tuple[int, int, int], width_px: int) -> None:
+    """Write a line of text, at a position for a tile of `TEXT_WIDTH_PX`, onto a tile of `width_px`."""
+    scale = width_px / TEXT_WIDTH_PX
+    left, base = round(at_px[0] * scale), round(at_px[1] * scale)
+    thickness = max(round(scale), 1)
+    cv2.putText(drawn, text, (left, base), cv2.FONT_HERSHEY_SIMPLEX, 0.5 * scale, colour, thickness, cv2.LINE_AA)
+
+
+def _make_tile(label: str, tile: Picture, tile_px: tuple[int, int]) -> Picture:
     """Return a tile with a picture scaled to fit and its label above."""
-    width, height = TILE_PX
+    width, height = tile_px
+    label_px = round(LABEL_PX * width / TEXT_WIDTH_PX)
     factor = min(width / tile.shape[1], height / tile.shape[0])
     scaled_width, scaled_height = max(round(tile.shape[1] * factor), 1), max(round(tile.shape[0] * factor), 1)
     interpolation = cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST
     scaled = cv2.resize(tile, (scaled_width, scaled_height), interpolation=interpolation)
-    whole = np.full((height + LABEL_PX, width, 3), 30, dtype=np.uint8)
-    left, top = (width - scaled_width) // 2, LABEL_PX + (height - scaled_height) // 2
+    whole = np.full((height + label_px, width, 3), 30, dtype=np.uint8)
+    left, top = (width - scaled_width) // 2, label_px + (height - scaled_height) // 2
     whole[top : top + scaled_height, left : left + scaled_width] = scaled
-    cv2.putText(whole, label, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    _write(whole, label, (6, 17), (255, 255, 255), width)
     return whole
 
 
@@ -146,10 +175,12 @@ def _draw_fit(trace: DetectionTrace, lane: Lane, bird_eye: BirdEye) -> Picture:
     return drawn
 
 
-def draw_lane(camera: CalibratedCamera, picture: Picture, lane: Lane) -> Picture:
+def draw_lane(
+    camera: CalibratedCamera, picture: Picture, lane: Lane, lane_confidence: float = TRACK_CONFIDENCE
+) -> Picture:
     """Return the picture with the lane drawn through the lens, unless its confidence is too low."""
     drawn = picture.copy()
-    if lane.confidence < TRACK_CONFIDENCE:
+    if lane.confidence < lane_confidence:
         return drawn
     left, right = (_parallel_line(lane.centre, side * lane.width_m / 2, lane.near_m, lane.far_m) for side in (1, -1))
     rim = picture_points(camera, np.concatenate([left, right[::-1]]))
@@ -163,16 +194,18 @@ def draw_lane(camera: CalibratedCamera, picture: Picture, lane: Lane) -> Picture
     return drawn
 
 
-def _confidence_text(trace: DetectionTrace, lane: Lane) -> Picture:
+def _confidence_text(
+    trace: DetectionTrace | None, lane: Lane, tile_px: tuple[int, int], lane_confidence: float
+) -> Picture:
     """Return a tile with the confidence and its components as text."""
-    drawn = np.full((TILE_PX[1], TILE_PX[0], 3), 30, dtype=np.uint8)
-    has_lane = lane.confidence >= TRACK_CONFIDENCE
-    lines = [f"confidence {lane.confidence:.2f}: " + ("a lane" if has_lane else f"no lane (below {TRACK_CONFIDENCE})")]
-    searched = trace.windows or trace.expected is None
-    lines.append("searched with windows" if searched else "tracked from the last picture")
-    if trace.fit is None:
+    drawn = np.full((tile_px[1], tile_px[0], 3), 30, dtype=np.uint8)
+    has_lane = lane.confidence >= lane_confidence
+    lines = [f"confidence {lane.confidence:.2f}: " + ("a lane" if has_lane else f"no lane (below {lane_confidence})")]
+    if trace is not None:
+        lines.append("searched with windows" if trace.is_search else "tracked from the last picture")
+    if trace is not None and trace.fit is None:
         lines.append("no two clear parallel lines, or an impossible lane")
-    else:
+    elif trace is not None and trace.fit is not None:
         fit = trace.fit
         lines += [
             f"left line visible {fit.left_visible:.2f}",
@@ -190,5 +223,5 @@ def _confidence_text(trace: DetectionTrace, lane: Lane) -> Picture:
         ]
     for number, line in enumerate(lines):
         colour = (255, 255, 255) if number else ((120, 230, 120) if has_lane else (90, 90, 255))
-        cv2.putText(drawn, line, (10, 28 + 25 * number), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
+        _write(drawn, line, (10, 28 + 25 * number), colour, tile_px[0])
     return drawn

@@ -17,7 +17,7 @@ from lavt.experiment.replay.drive import read_driver_view, read_replay_drive
 from lavt.experiment.replay.replay import replay_pictures
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.run import run_once
-from lavt.perception.lane_detector import TRACK_CONFIDENCE
+from lavt.perception.detection import TRACK_CONFIDENCE
 from lavt.transport.video.stamp import read_stamp
 
 

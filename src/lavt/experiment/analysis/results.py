@@ -40,7 +40,7 @@ IDENTITY_KEYS = (
 )
 """The keys that identify a run; their values are known before the run. A key that does not apply is null."""
 
-OPTIONAL_IDENTITY_KEYS = ("axes", "changes", "injected_ms", "injected_least_ms")
+OPTIONAL_IDENTITY_KEYS = ("detector", "axes", "changes", "injected_ms", "injected_least_ms")
 """Further keys that only some runs have in their identity."""
 
 
@@ -55,10 +55,11 @@ def run_result(
 ) -> dict[str, Any]:
     """Compute the run's `result.json`, which is also its entry in `summary.json`, from its records.
 
-    `identity` has the keys `IDENTITY_KEYS`. It can also have `axes` (the values of a sweep's further axes), `changes`
-    (of the condition), `injected_ms` (the requested delay) and `injected_least_ms` (the smallest expected delay, if it
-    is smaller than `injected_ms`); all of them are copied. `reasons` are further reasons why the run is invalid, and
-    `checks` further measured checks, which its records do not show.
+    `identity` has the keys `IDENTITY_KEYS`. It can also have `detector` (if it is not LAVT's own), `axes` (the values
+    of a sweep's further axes), `changes` (of the condition), `injected_ms` (the requested delay) and
+    `injected_least_ms` (the smallest expected delay, if it is smaller than `injected_ms`); all of them are copied.
+    `reasons` are further reasons why the run is invalid, and `checks` further measured checks, which its records do
+    not show.
     """
     measured = measure(server, client)
     all_reasons = [*invalid_reasons(server, client, measured), *reasons]

@@ -13,7 +13,7 @@ import numpy as np
 from lavt.domain import NS_PER_S, FloatArray, Lane, Picture
 from lavt.experiment.replay.drive import ReplayDrive, Scene
 from lavt.perception.calibration import CalibratedCamera
-from lavt.perception.lane_detector import TRACK_CONFIDENCE
+from lavt.perception.detection import TRACK_CONFIDENCE
 from lavt.perception.panel import CENTRE, LEFT, draw_lane
 
 Colour = tuple[int, int, int]

@@ -51,6 +51,7 @@ def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
     return RunConfig(
         vehicle=server.vehicle,
         controller=client.controller,
+        perception=client.perception,
         camera=server.camera,
         video=VideoConfig(
             **{key: getattr(server.video, key) for key in VideoConfig.model_fields}
@@ -83,6 +84,7 @@ def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]
         "driver": run.controller.kind,
         "repetition": 0,
         "seed": run.seed,
+        **({"detector": client.perception.settings} if client.perception.settings else {}),
         **injected_entry(run_condition),
     }
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from lavt.assembly.detection.detectors import check_detector
 from lavt.assembly.entropy import run_seed
 from lavt.assembly.injection import NO_CONDITION, netem_flows
 from lavt.assembly.links import link_injection
@@ -53,6 +54,12 @@ def plan_run(
         )
     requested = config.network.requested(condition(config.network.condition))
     check_names(config.vehicle, config.controller)
+    check_detector(config.perception.detector)
+    if config.fidelity == "geometry" and config.perception.settings:
+        raise UserError(
+            "fidelity geometry has no pictures for a detector: leave out perception.detector, or choose fidelity "
+            "pixels or video"
+        )
     _check_injection(config, requested)
     is_unimpaired = config.network.inherent == "loopback" and requested == NO_CONDITION
     if config.time == "real" and config.network.injection == "none" and not is_unimpaired:
@@ -85,6 +92,7 @@ def plan_run(
         "repetition": config.repetition,
         "seed": seed,
         **injected_entry(requested),
+        **({"detector": config.perception.settings} if config.perception.settings else {}),
         **({"axes": dict(axes)} if axes else {}),
         **({"changes": config.network.changes} if config.network.changes else {}),
     }

@@ -64,6 +64,7 @@ def client_config(
     """
     return ClientConfig(
         controller=run.controller,
+        perception=run.perception,
         console=ConsoleConfig(shows_latency=run.study.participant is None),
         camera=ClientCameraConfig(**run.camera.model_dump()),
         video=ClientVideoConfig(port=video_port, reorder_hold_ms=run.video.reorder_hold_ms),
