@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from tests.nodes.stand_ins import MONO_NS, WALL_NS, at, payloads
 from tests.nodes.test_human_driver import HumanBench
 
+from lavt.control.loop_history import STATE_AGE_NS
 from lavt.control.prediction import CarModel, Prediction, RelativePose
 from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, State
 from lavt.node import Send
-from lavt.nodes.page_prediction import STATE_AGE_NS, EffectDelay, Outline, PagePredictor, draw
+from lavt.nodes.page_prediction import Outline, PagePredictor, draw
 from lavt.nodes.payloads import ReceivedUnit
 from lavt.perception.calibration import CalibratedCamera, calibrated_pinhole_camera
 from lavt.transport.messages import encode
@@ -129,9 +130,9 @@ def test_a_command_turns_the_ghost_as_long_as_it_acts(acting_ns: int) -> None:
     predictor, control_ns, now_ns = PagePredictor(MODEL, OUTLINE, CAMERA), 250 * NS_PER_MS, 100 * STEP_NS
     sent = [(number, number * STEP_NS) for number in range(101)]
     for number, at_ns in sent:
-        predictor.note_command(number, 0.05 if at_ns >= now_ns - acting_ns else 0.0, at_ns)
+        predictor.history.note_command(number, 0.05 if at_ns >= now_ns - acting_ns else 0.0, at_ns)
         applied = max((n for n, t in sent[: number + 1] if t + control_ns <= at_ns), default=-1)
-        predictor.note_state(state(at_ns, applied), at_ns)
+        predictor.history.note_state(state(at_ns, applied), at_ns)
     prediction = predictor.predict_since(WALL_NS + now_ns - VIDEO_NS, now_ns)
     assert prediction is not None
     least, most = (turned_after(max(0, acting_ns + error_ns)) for error_ns in (-STEP_NS // 2, STEP_NS // 2))
@@ -199,34 +200,6 @@ def test_the_display_changes_no_command(steering: list[float]) -> None:
             bench.unit()
     assert shown.commands == hidden.commands
     assert hidden.prediction() is None
-
-
-@given(st.integers(0, 400 * NS_PER_MS), st.integers(0, STEP_NS), st.integers(-(10**15), 10**15))
-def test_the_delay_is_known_to_half_the_states_period(delay_ns: int, phase_ns: int, clock_ns: int) -> None:
-    """Whatever the clocks and the phases, the states tell when commands take effect to 10 ms."""
-    delay = EffectDelay()
-    sent = [(number, number * STEP_NS) for number in range(60)]
-    for number, at_ns in sent:
-        delay.note_command(number, at_ns)
-        now_ns = at_ns + phase_ns
-        applied = max((n for n, t in sent[: number + 1] if t + delay_ns <= now_ns), default=-1)
-        delay.note_state(state(now_ns + clock_ns, applied), now_ns)
-    found_ns = delay.at_ns(sent[-1][1])
-    assert found_ns is not None
-    assert found_ns == pytest.approx(WALL_NS + clock_ns + delay_ns, abs=STEP_NS / 2 + 1)
-    assert delay.at_ns(sent[-1][1] + NS_PER_S) is None
-
-
-def test_a_clock_that_is_set_back_forgets_the_delay() -> None:
-    """After the vehicle's clock was set back, the delay is unknown until a newly applied command bounds it again."""
-    delay = EffectDelay()
-    for number in range(4):
-        delay.note_command(number, number * STEP_NS)
-    for number, clock_ns in ((0, 0), (1, 0), (2, -NS_PER_S), (3, -NS_PER_S)):
-        delay.note_state(state(number * STEP_NS + clock_ns, number), number * STEP_NS)
-        if number == 2:
-            assert delay.at_ns(number * STEP_NS) is None
-    assert delay.at_ns(3 * STEP_NS) == WALL_NS - NS_PER_S - STEP_NS // 2
 
 
 def test_an_outline_that_is_not_in_view_is_left_out() -> None:

@@ -338,7 +338,7 @@ class HumanDriverNode(Commander):
         self._round_trip.note_command(self._sequence, now.mono_ns)
         self._last = now.mono_ns, decision
         if self._predictor is not None:
-            self._predictor.note_command(self._sequence, decision.steering_rad, now.mono_ns)
+            self._predictor.history.note_command(self._sequence, decision.steering_rad, now.mono_ns)
 
     def _note_state(self, message: Message, now: Now) -> None:
         super()._note_state(message, now)
@@ -356,9 +356,9 @@ class HumanDriverNode(Commander):
         if state is not None and self.session.has_control:
             self._round_trip.note_applied(state.applied_sequence, now.mono_ns)
             if self._predictor is not None:
-                self._predictor.note_state(state, now.mono_ns)
+                self._predictor.history.note_state(state, now.mono_ns)
         elif self._predictor is not None:
-            self._predictor.forget()
+            self._predictor.history.forget()
 
     # Status.
 

@@ -91,11 +91,11 @@ def watch_driver(loop: VirtualLoop, predictor: PagePredictor) -> dict[int, Predi
         prediction = predictor.predict_since(driver._view.stamp_ns, now.mono_ns)
         if prediction is not None:
             found[driver._sequence] = Predicted(driver._view.stamp_ns, prediction)
-        predictor.note_command(driver._sequence, decision.steering_rad, now.mono_ns)
+        predictor.history.note_command(driver._sequence, decision.steering_rad, now.mono_ns)
 
     def note_state(now: Now) -> None:
         if driver.session.has_control:
-            predictor.note_state(driver._newest_state, now.mono_ns)
+            predictor.history.note_state(driver._newest_state, now.mono_ns)
 
     driver._note_command, driver._handle_newer_state = note_command, note_state
     return found
