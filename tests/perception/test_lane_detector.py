@@ -19,10 +19,10 @@ from tests.perception.lens import ground_points
 from lavt.domain import CameraModel, Lane, Picture, SeenLane
 from lavt.perception.bird_eye import STAMP_SIDE_PX
 from lavt.perception.calibration import CalibratedCamera, calibrated_pinhole_camera
+from lavt.perception.detection import TRACK_CONFIDENCE
 from lavt.perception.lane_detector import (
     FORGET_AFTER_PICTURES,
     SMOOTHING,
-    TRACK_CONFIDENCE,
     GroundTruthLaneDetector,
     LaneDetector,
 )
