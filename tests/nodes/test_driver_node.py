@@ -15,6 +15,7 @@ from lavt.channels import CHANNELS
 from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.control.drive_controller import DriveController, make_controller
 from lavt.control.lane_watch import LANE_CONFIDENCE
+from lavt.control.loop_history import LoopHistory
 from lavt.control.preset import DESIGNED
 from lavt.domain import (
     NS_PER_MS,
@@ -79,6 +80,13 @@ class StampedController(FakeController):
     def note_stamp(self, stamp_ns: int) -> None:
         """Store the stamp."""
         self.stamps_ns.append(stamp_ns)
+
+
+@dataclass
+class HistoryController(FakeController):
+    """A fake controller that also reads what the node notes of its loop."""
+
+    history: LoopHistory = field(default_factory=LoopHistory)
 
 
 class Bench:
@@ -347,6 +355,21 @@ def test_a_controller_that_reads_stamps_gets_the_stamp_of_each_picture() -> None
         stamps_ns.append(WALL_NS + bench.mono_ns)
     assert isinstance(bench.controller, StampedController)
     assert bench.controller.stamps_ns == stamps_ns
+
+
+def test_a_controller_with_a_history_gets_commands_and_states() -> None:
+    """The history of a controller has the commands sent and the states while this client has control."""
+    controller = HistoryController()
+    bench = Bench(controller=controller).start_driving()
+    bench.mono_ns += 20 * NS_PER_MS
+    bench.deliver_state("driving", 3.0)
+    assert [motion.speed_mps for motion in controller.history.motions(0)] == [0.0, 3.0]
+    (first, *_) = controller.history.commands(5, 0)
+    assert (first.at_ns, first.steering_rad) == (MONO_NS + 5, 0.125)
+    bench.deliver("operator", "release")
+    bench.mono_ns += 20 * NS_PER_MS
+    bench.deliver_state("driving", 4.0)
+    assert controller.history.motions(0) == []
 
 
 def test_grey_pictures_lead_to_a_stop() -> None:

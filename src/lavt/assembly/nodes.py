@@ -15,6 +15,7 @@ from lavt.assembly.security import build_cipher
 from lavt.assembly.vehicles import VehicleSetup, check_vehicle, physics_sample_times
 from lavt.config import HUMAN, ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.client_limits import CLIENT_LIMITS
+from lavt.control.compensation import VARIANTS, CompensatingController, CompensationSettings
 from lavt.control.drive_controller import DriveController, make_controller
 from lavt.control.human_controls import HUMAN_LIMITS, HumanControls
 from lavt.control.prediction import CarModel
@@ -102,6 +103,12 @@ def build_controller(config: ControllerConfig, seed: int = 1) -> DriveController
     if config.kind == TWO_POINT:
         model = TwoPointSettings(**config.two_point.model_dump())
         return TwoPointDriver(config.effective_preset(), wheelbase_m=config.wheelbase_m, settings=model, seed=seed)
+    if config.kind in VARIANTS:
+        variant, preset = VARIANTS[config.kind], config.effective_preset()
+        if config.lookahead_s is None:
+            preset = replace(preset, lookahead_s=variant.lookahead_s)
+        known = CompensationSettings(**config.compensation.model_dump())
+        return CompensatingController(variant, preset, wheelbase_m=config.wheelbase_m, settings=known)
     return make_controller(config.kind, config.effective_preset(), config.wheelbase_m)
 
 

@@ -12,6 +12,7 @@ from lavt.config.camera import ClientCameraConfig as ClientCameraConfig
 from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
 from lavt.config.carla import CarlaConfig as CarlaConfig
 from lavt.config.controller import HUMAN as HUMAN
+from lavt.config.controller import CompensationConfig as CompensationConfig
 from lavt.config.controller import ControllerConfig as ControllerConfig
 from lavt.config.controller import PredictionConfig as PredictionConfig
 from lavt.config.controller import TwoPointConfig as TwoPointConfig

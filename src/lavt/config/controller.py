@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from lavt.config.section import Section
 from lavt.config.vehicle import MAX_SIMULATED_MPS
+from lavt.control.compensation import VARIANTS, CompensationSettings
 from lavt.control.preset import Preset, find_preset
 from lavt.control.two_point import TWO_POINT, TwoPointSettings
 
@@ -17,6 +18,7 @@ HUMAN = "human"
 
 
 _MODEL = TwoPointSettings()
+_COMPENSATION = CompensationSettings()
 
 
 class TwoPointConfig(Section):
@@ -74,12 +76,37 @@ class PredictionConfig(Section):
     """Time constant with which the wheels follow a command; by default the built-in car's."""
 
 
+class CompensationConfig(Section):
+    """The controllers that know the delay of their loop (`docs/compensation.md`), and what they know of the vehicle."""
+
+    steering_lag_s: float = Field(_COMPENSATION.steering_lag_s, ge=0, le=2)
+    """Time constant with which the wheels follow a command; by default the built-in car's."""
+    steering_dead_time_s: float = Field(_COMPENSATION.steering_dead_time_s, ge=0, le=2)
+    """Time until the wheels begin to follow a command."""
+    steering_rate_radps: float = Field(_COMPENSATION.steering_rate_radps, gt=0, le=10)
+    """The largest rate of the wheels' angle; by default the built-in car's."""
+    camera_delay_s: float = Field(_COMPENSATION.camera_delay_s, ge=0, le=1)
+    """Time from the exposure of a picture to its stamp; by default the built-in camera's."""
+    average_lag_s: float = Field(_COMPENSATION.average_lag_s, ge=0, le=1)
+    """By how much the lane detector's moving average makes the lane older; by default at 30 Hz."""
+    delay_error_s: float = Field(_COMPENSATION.delay_error_s, ge=-1, le=1)
+    """Added to the measured delay, to show what a wrong estimate costs."""
+    constant_delay_s: float = Field(_COMPENSATION.constant_delay_s, ge=0, le=3)
+    """The total delay that the kind `constant_delay` assumes, from the exposure until a command takes effect."""
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """Settings that differ from the defaults."""
+        return {name: value for name, value in self.model_dump().items() if value != getattr(_COMPENSATION, name)}
+
+
 class ControllerConfig(Section):
     """The controller that drives."""
 
     kind: str = "lane_keeper"
-    """lane_keeper: the built-in controller; two_point: a model of a human driver; human: a person drives from a web
-    page (`docs/drive.md`); or the name of your own (`docs/controllers.md`)."""
+    """lane_keeper: the built-in controller; predictive, smith, constant_delay, scheduled_lookahead and slow_down: lane
+    keepers that know the delay (`docs/compensation.md`); two_point: a model of a human driver; human: a person drives
+    from a web page (`docs/drive.md`); or the name of your own (`docs/controllers.md`)."""
     preset: str = "designed"
     """The set of gains: designed (found by theory) or paper_calibrated (fitted to the paper, `docs/controllers.md`)."""
     lookahead_s: float | None = Field(None, ge=0.2, le=5)
@@ -95,6 +122,7 @@ class ControllerConfig(Section):
     """The lowest confidence of a lane that is followed, a share of 1; 0.2 in both presets (`docs/perception.md`). A
     picture with less counts as a picture without a lane."""
     two_point: TwoPointConfig = TwoPointConfig()
+    compensation: CompensationConfig = CompensationConfig()
     prediction: PredictionConfig = PredictionConfig()
     wheelbase_m: float = Field(2.8448, gt=0.5, lt=10)
     """The wheelbase of the driven vehicle; by default the built-in car's."""
@@ -121,6 +149,8 @@ class ControllerConfig(Section):
         changes = dict(self.changes)
         if self.kind == TWO_POINT:
             changes |= {f"two_point.{name}": value for name, value in self.two_point.changes.items()}
+        if self.kind in VARIANTS:
+            changes |= {f"compensation.{name}": value for name, value in self.compensation.changes.items()}
         shown = ["prediction.shown"] if self.kind == HUMAN and self.prediction.shown else []
         return ", ".join([self.preset, *shown, *(f"{name} {_format(value)}" for name, value in changes.items())])
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from importlib.metadata import entry_points
 from typing import Protocol, runtime_checkable
 
+from lavt.control.compensation import VARIANTS, CompensatingController
+from lavt.control.loop_history import LoopHistory
 from lavt.control.preset import Preset
 from lavt.control.pure_pursuit import (
     RememberedLane,
@@ -35,6 +38,13 @@ class StampReader(Protocol):
     def note_stamp(self, stamp_ns: int) -> None:
         """Note the stamp of the picture whose lane the next call of `decide` gets."""
         ...
+
+
+@runtime_checkable
+class LoopReader(Protocol):
+    """A controller that also uses the states of the vehicle and the commands sent, which the driver node notes here."""
+
+    history: LoopHistory
 
 
 class LaneKeeper:
@@ -80,7 +90,11 @@ class ControllerFactory(Protocol):
         ...
 
 
-CONTROLLERS: dict[str, ControllerFactory] = {"lane_keeper": LaneKeeper, TWO_POINT: TwoPointDriver}
+CONTROLLERS: dict[str, ControllerFactory] = {
+    "lane_keeper": LaneKeeper,
+    TWO_POINT: TwoPointDriver,
+    **{kind: partial(CompensatingController, variant) for kind, variant in VARIANTS.items()},
+}
 
 ENTRY_POINTS = "lavt.controllers"
 """Entry point group under which a package registers a `ControllerFactory`."""

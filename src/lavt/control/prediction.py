@@ -34,7 +34,7 @@ class CarModel:
     """The largest rate of the road wheels' angle."""
     steering_lag_s: float
     """The time constant with which the wheels follow; 0: at the largest rate."""
-    stop_deceleration_mps2: float
+    stop_deceleration_mps2: float = 4.0
     """The deceleration with which the car stops at the stopping line."""
 
 
@@ -82,6 +82,13 @@ class Prediction:
         return self.stop[-1]
 
 
+class PredictedPath(NamedTuple):
+    """The path from the pose in a picture, which is the origin, and the angle of the wheels at its end."""
+
+    path: tuple[RelativePose, ...]
+    steering_rad: float
+
+
 def predict(
     model: CarModel,
     motions: Sequence[Motion],
@@ -89,6 +96,22 @@ def predict(
     picture_ns: int,
     effect_ns: int,
 ) -> Prediction | None:
+    """Predict the path, as `predict_path` does, and a stop at its end."""
+    predicted = predict_path(model, motions, commands, picture_ns, effect_ns)
+    if predicted is None:
+        return None
+    target_rad = commands[-1].steering_rad if commands else predicted.steering_rad
+    stop = _stop(model, predicted.path[-1], motions[-1].speed_mps, predicted.steering_rad, target_rad)
+    return Prediction(predicted.path, stop)
+
+
+def predict_path(
+    model: CarModel,
+    motions: Sequence[Motion],
+    commands: Sequence[SteeringCommand],
+    picture_ns: int,
+    effect_ns: int,
+) -> PredictedPath | None:
     """Predict from the picture of `picture_ns` to `effect_ns`, when a command that is sent now takes effect.
 
     Both sequences have the oldest first. Until the newest of `motions`, the car moves as reported; after it, it follows
@@ -117,8 +140,7 @@ def predict(
             mean_rad = (steering_rad + next_rad) / 2
             path.append(_move(path[-1], newest.speed_mps * duration_s, mean_rad, model.wheelbase_m))
         steering_rad, at_ns = next_rad, until_ns
-    target_rad = commands[-1].steering_rad if commands else steering_rad
-    return Prediction(tuple(path), _stop(model, path[-1], newest.speed_mps, steering_rad, target_rad))
+    return PredictedPath(tuple(path), steering_rad)
 
 
 def _is_possible(motion: Motion) -> bool:

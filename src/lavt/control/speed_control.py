@@ -68,7 +68,8 @@ class SpeedKeeper:
     """The pedals of a driver that keeps a speed: PI control, slower if the lane is badly visible."""
 
     def __init__(self, speed_mps: float, lane_confidence: float = LANE_CONFIDENCE) -> None:
-        self._full_speed_mps = speed_mps
+        self.full_speed_mps = speed_mps
+        """The speed with a well visible lane."""
         self._lane_confidence = lane_confidence
         self._controller = SpeedPiController()
 
@@ -79,5 +80,5 @@ class SpeedKeeper:
         """
         if confidence < self._lane_confidence:
             return pedals(0.0)
-        target_mps = speed_for_confidence_mps(self._full_speed_mps, confidence)
+        target_mps = speed_for_confidence_mps(self.full_speed_mps, confidence)
         return pedals(self._controller.acceleration_mps2(target_mps, speed_mps, step_s))

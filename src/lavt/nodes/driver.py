@@ -11,7 +11,7 @@ from typing import Protocol
 from msgspec import Struct
 
 from lavt.control.client_limits import ClientLimits
-from lavt.control.drive_controller import DriveController, StampReader
+from lavt.control.drive_controller import DriveController, LoopReader, StampReader
 from lavt.control.lane_watch import LANE_CONFIDENCE, LaneState, LaneWatch
 from lavt.domain import Decision, FramePayload, Lane, Mode, Now
 from lavt.node import Message, Send, Stage
@@ -65,6 +65,7 @@ class DriverNode(Commander):
         self._detector = detector
         self._controller = controller
         self._stamp_reader = controller if isinstance(controller, StampReader) else None
+        self._history = controller.history if isinstance(controller, LoopReader) else None
         self._lane_watch = LaneWatch(lane_confidence)
         self._detected_stamp_ns = 0
         self._decision: Decision | None = None
@@ -117,3 +118,17 @@ class DriverNode(Commander):
         if self._lane_state == "brake":
             return "drive", braking(decision, self._limits.brake)
         return mode, limited
+
+    # What a controller that knows its loop gets.
+
+    def _note_command(self, decision: Decision, now: Now) -> None:
+        if self._history is not None:
+            self._history.note_command(self._sequence, decision.steering_rad, now.mono_ns)
+
+    def _handle_newer_state(self, now: Now) -> None:
+        if self._history is None or self._newest_state is None:
+            return
+        if self.session.has_control:
+            self._history.note_state(self._newest_state, now.mono_ns)
+        else:
+            self._history.forget()

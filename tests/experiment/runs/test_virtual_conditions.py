@@ -18,7 +18,7 @@ from lavt.experiment.runs.virtual_run import build_loop, drive
 from lavt.recording.record import read_record
 from lavt.recording.table import MISSING
 
-IMPAIRED_CONDITIONS = sorted(set(conditions()) - {"L0", "L1", "L2", "L3", "L4", "L5"})
+IMPAIRED_CONDITIONS = sorted(name for name in conditions() if name[0] not in "LH")
 
 
 def all_but_one_full(names: list[str], quick: str) -> list[Any]:

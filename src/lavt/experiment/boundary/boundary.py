@@ -21,6 +21,7 @@ from lavt.domain import NS_PER_MS
 from lavt.errors import UserError, WorkError, describe_error
 from lavt.experiment.analysis.results import write_json
 from lavt.experiment.boundary.bisection import Bracket, first_bracket, zero_bracket
+from lavt.experiment.boundary.compensation_margin import configured_margin_s
 from lavt.experiment.boundary.delay_margin import configured_loop, critical_delay_s
 from lavt.experiment.boundary.oscillation_growth import straight_growth
 from lavt.experiment.report.boundary_section import boundary_figure
@@ -177,8 +178,8 @@ def _middle_ms(bracket: Bracket, total_delay: TotalDelay) -> float | None:
 def theoretical_ms(config: RunConfig) -> float | None:
     """Return the delay margin of the configured loop in ms; None if the loop has no model or no finite margin."""
     loop = configured_loop(config)
-    critical_s = math.inf if loop is None else critical_delay_s(loop)
-    return critical_s * 1000 if math.isfinite(critical_s) else None
+    critical_s = configured_margin_s(config) if loop is None else critical_delay_s(loop)
+    return None if critical_s is None or math.isinf(critical_s) else critical_s * 1000
 
 
 def run_searches(

@@ -75,15 +75,21 @@ def configured_loop(config: RunConfig) -> LateralLoop | None:
     The lookahead is the controller's lookahead at the preset's speed. The result is None if the car or the controller
     is not LAVT's, because these have no model. Raises `UserError` for a preset or car that does not exist.
     """
-    controller, vehicle = config.controller, config.vehicle
-    if (controller.kind, vehicle.kind) != ("lane_keeper", "simulator"):
+    if (config.controller.kind, config.vehicle.kind) != ("lane_keeper", "simulator"):
         return None
+    return run_loop(config, None)
+
+
+def run_loop(config: RunConfig, lookahead_s: float | None) -> LateralLoop:
+    """Return the loop of a run with this lookahead; None: that of its preset, with the run's changes."""
+    controller = config.controller
     preset = controller.effective_preset()
+    lookahead_s = preset.lookahead_s if lookahead_s is None else lookahead_s
     return LateralLoop(
-        lookahead_s=lookahead_m(preset.lookahead_s, preset.speed_mps) / preset.speed_mps,
+        lookahead_s=lookahead_m(lookahead_s, preset.speed_mps) / preset.speed_mps,
         speed_mps=preset.speed_mps,
         frame_rate_hz=config.camera.rate_hz,
-        car=car_of(vehicle),
+        car=car_of(config.vehicle),
         controller_wheelbase_m=controller.wheelbase_m,
     )
 
