@@ -88,6 +88,7 @@ def config(kind: str, *changes: str) -> RunConfig:
         f"controller.kind={kind}",
         "network.condition=L0",
         "safety.picture_age_limit_ms=2000",
+        "safety.stopping_distance_limit_m=200",
     )
     return load_config(RunConfig, shipped("configs/demo.yaml"), ["time=virtual", *settings, *changes])
 
