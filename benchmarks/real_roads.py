@@ -1,6 +1,7 @@
 """Print how the lane detector does on real road pictures, and how reliable its confidence is there.
 
     python -m benchmarks.real_roads [--directory out/real_roads] [--offline] [--part seen] [--draw out/drawn]
+                                    [--detector onnx --detector-file lanes.yaml]
 
 `real_roads.yaml` names the repository, commit, path and SHA-256 of each picture, and has labels: points of the lane's
 lines, set by eye. A picture that is not in the directory is fetched from the public repository, unless
@@ -28,13 +29,16 @@ import numpy as np
 import yaml
 
 from lavt.assembly.cameras import calibrated_camera
+from lavt.assembly.detection.detectors import build_detector
 from lavt.config import CalibrationConfig
+from lavt.config.perception import BUILT_IN
 from lavt.config_file import parse_config
 from lavt.control.lane_watch import LANE_CONFIDENCE
 from lavt.domain import FloatArray, Lane, Picture
 from lavt.errors import UserError
 from lavt.perception.calibration import CalibratedCamera, axes, picture_points
-from lavt.perception.lane_detector import GRID, LaneDetector
+from lavt.perception.detection import DetectorSettings
+from lavt.perception.lane_detector import GRID
 from lavt.perception.panel import draw_lane
 
 DATA = Path(__file__).with_suffix(".yaml")
@@ -183,9 +187,9 @@ def _continued(x: FloatArray, line: FloatArray) -> FloatArray:
     return np.asarray(np.interp(x, xs, np.concatenate([[ends_y[0]], line[:, 1], [ends_y[1]]])), dtype=np.float64)
 
 
-def check_road(road: RoadPicture) -> Verdict:
-    """Search a picture for a lane, and judge it."""
-    lane = LaneDetector(road.camera, stamped=False).detect(road.picture)
+def check_road(road: RoadPicture, detector: str = BUILT_IN, file: str = "") -> Verdict:
+    """Search a picture for a lane with the detector of that name, and judge it."""
+    lane = build_detector(detector, road.camera, DetectorSettings(stamped=False, file=file)).detect(road.picture)
     return Verdict(road, lane, judge(road.lines_m, lane))
 
 
@@ -216,12 +220,12 @@ def reliability_table(verdicts: Sequence[Verdict]) -> str:
     return "\n".join(lines)
 
 
-def cost_ms(roads: Iterable[RoadPicture]) -> tuple[float, float]:
+def cost_ms(roads: Iterable[RoadPicture], detector_name: str = BUILT_IN, file: str = "") -> tuple[float, float]:
     """Return the median CPU times of a picture in milliseconds: while searching, and while following a lane."""
     searching_s: list[float] = []
     following_s: list[float] = []
     for road in roads:
-        detector = LaneDetector(road.camera, stamped=False)
+        detector = build_detector(detector_name, road.camera, DetectorSettings(stamped=False, file=file))
         for _ in range(REPETITIONS):
             detector.forget()
             for times_s in (searching_s, following_s):
@@ -253,6 +257,8 @@ def main() -> None:
     parser.add_argument("--directory", type=Path, default=Path("out/real_roads"), help="pictures: OWNER/NAME/PATH")
     parser.add_argument("--offline", action="store_true", help="fetch nothing")
     parser.add_argument("--part", choices=["seen", "unseen", "all"], default="all")
+    parser.add_argument("--detector", default=BUILT_IN, help="the name of the detector, as perception.detector")
+    parser.add_argument("--detector-file", default="", help="the detector's file, as perception.file")
     parser.add_argument("--threshold", type=float, default=LANE_CONFIDENCE)
     parser.add_argument("--draw", type=Path, default=None, help="directory for the pictures with lanes and labels")
     arguments = parser.parse_args()
@@ -264,7 +270,7 @@ def main() -> None:
     if not roads:
         print("no picture is left: see the reasons above")
         return
-    verdicts = [check_road(road) for road in roads]
+    verdicts = [check_road(road, arguments.detector, arguments.detector_file) for road in roads]
     for number, verdict in enumerate(verdicts):
         if verdict.judgement != "right" or not verdict.believed(arguments.threshold):
             print(f"{verdict.outcome(arguments.threshold)} {verdict.lane.confidence:.2f} {verdict.road.name}")
@@ -275,7 +281,7 @@ def main() -> None:
         of_part = [verdict for verdict in verdicts if verdict.road.part == part]
         print(f"\npart {part}, threshold {arguments.threshold}:\n\n{outcome_table(of_part, arguments.threshold)}")
     print(f"\n{reliability_table(verdicts)}")
-    searching_ms, following_ms = cost_ms(roads)
+    searching_ms, following_ms = cost_ms(roads, arguments.detector, arguments.detector_file)
     print(f"\ncost of a picture: searching {searching_ms:.2f} ms, following {following_ms:.2f} ms (median CPU times)")
 
 

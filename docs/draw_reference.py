@@ -35,6 +35,7 @@ from lavt.config import (
     SweepConfig,
 )
 from lavt.config.dbw import ProfileConfig
+from lavt.config.perception import NeuralNetworkConfig
 
 FOLDER = Path(__file__).resolve().parent
 SOURCE = "`python docs/draw_reference.py` writes this page from the code."
@@ -90,6 +91,10 @@ TOPS: dict[str, tuple[type[Section], str]] = {
     "a relay": (RelayConfig, "for `lavt relay`: `configs/relay.yaml`"),
     "a rendezvous": (RendezvousConfig, "for `lavt rendezvous`: `configs/rendezvous.yaml`"),
     "a calibration": (CalibrationConfig, "a file that `camera.calibration` names ([camera.md](camera.md))"),
+    "a neural network": (
+        NeuralNetworkConfig,
+        "a file that `perception.file` names for the detector `onnx` ([perception.md](perception.md#a-neural-network))",
+    ),
     "a condition": (Condition, "an entry of `netem/conditions.yaml` ([network.md](network.md))"),
     "a by-wire profile": (ProfileConfig, "a file that `vehicle.dbw.profile` names ([by_wire.md](by_wire.md))"),
     "costs": (Costs, "`configs/costs.yaml` ([virtual_time.md](virtual_time.md))"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lavt.assembly.cameras import client_camera
 from lavt.assembly.detection.detectors import build_detector
@@ -61,15 +61,24 @@ def _track_confidence(config: ClientConfig) -> float:
 
 
 def _lane_detector(config: ClientConfig) -> PictureDetector:
+    return _build_lane_detector(config, None)
+
+
+def _timed_lane_detector(config: ClientConfig) -> PictureDetector:
+    return _build_lane_detector(config, config.camera.rate_hz)
+
+
+def _build_lane_detector(config: ClientConfig, rate_hz: float | None) -> PictureDetector:
     settings = DetectorSettings(track_confidence=_track_confidence(config), file=config.perception.file)
-    return build_detector(config.perception.detector, client_camera(config.camera), settings)
+    return build_detector(config.perception.detector, client_camera(config.camera), settings, rate_hz=rate_hz)
 
 
 def _ground_truth_detector(config: ClientConfig) -> GroundTruthLaneDetector:
     return GroundTruthLaneDetector(_track_confidence(config))
 
 
-VIDEO = FidelityModel(build_vehicle_setup, _video_sender, _video_receiver, _lane_detector)
+VIDEO = FidelityModel(build_vehicle_setup, _video_sender, _video_receiver, _timed_lane_detector)
+"""Coded video in real time: a detector that cannot keep the rate of the pictures is rejected."""
 
 
 def _pixels() -> FidelityModel:
@@ -82,9 +91,9 @@ def _geometry() -> FidelityModel:
 
 
 FIDELITIES: dict[str, Callable[[], FidelityModel]] = {
-    "video": lambda: VIDEO,
+    "video": lambda: replace(VIDEO, detector=_lane_detector),
     "pixels": _pixels,
     "geometry": _geometry,
 }
 """The models by the config's `fidelity`. Each run gets a new model, because with `pixels` its two sides share a
-codec."""
+codec. They are for virtual time, in which a result never depends on the speed of the machine."""

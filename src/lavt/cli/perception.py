@@ -234,14 +234,15 @@ def _sentence(file: Path, rows: Sequence[Row], drawn: Path | None) -> str:
     of_file = [row for row in rows if row["source"] == str(file)]
     confidences = [row["confidence"] for row in of_file]
     followed = sum(row["followed"] for row in of_file)
+    detection_ms = median(row["detection_ms"] for row in of_file)
     if len(of_file) == 1:
         (row,) = of_file
         found = f"a lane, centre {row['centre_m']:+.2f} m, width {row['width_m']:.2f} m" if followed else "no lane"
-        text = f"{file}: confidence {row['confidence']:.2f}, {found}"
+        text = f"{file}: confidence {row['confidence']:.2f}, {found}, detected in {detection_ms:.1f} ms"
     else:
         text = (
             f"{file}: {len(of_file)} pictures, {followed} with a lane ({100 * followed / len(of_file):.0f} %), median "
-            f"confidence {median(confidences):.2f}"
+            f"confidence {median(confidences):.2f}, detected in {detection_ms:.1f} ms (median)"
         )
     return text if drawn is None else f"{text}; the steps are in {drawn}"
 
