@@ -86,6 +86,11 @@ class Tab:
         event = {"code": code, "windowsVirtualKeyCode": KEY_CODES.get(code, ord(code[-1]))}
         self.call("Input.dispatchKeyEvent", type="rawKeyDown" if down else "keyUp", key=code, **event)
 
+    def keys(self, downs: Mapping[str, bool]) -> None:
+        """Press or release several keys."""
+        for code, down in downs.items():
+            self.key(code, down=down)
+
     def point(self, x: float = 300, y: float = 200) -> None:
         """Move the pointer to a place over the page."""
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)

@@ -16,6 +16,8 @@ from lavt.experiment.runs.processes import Process, Processes
 AnyTab = Tab | FirefoxTab
 HERE = Path(__file__).parent
 TIMEOUT_S = 300
+SETTINGS = ("vehicle.scenery=none", "camera.width_px=320", "camera.height_px=240")
+"""Settings of a drive that leave processor time for a browser."""
 ATTEMPTS = 8
 REPEAT_KEYS = """(() => {
   let newest = null;
@@ -74,7 +76,7 @@ class PersonDrive:
 @pytest.fixture
 def person_drive(browser: Browser, tmp_path: Path) -> Iterator[PersonDrive]:
     with Processes(tmp_path) as processes:
-        settings = ("--set", "vehicle.scenery=none", "--set", "camera.width_px=320", "--set", "camera.height_px=240")
+        settings = [option for setting in SETTINGS for option in ("--set", setting)]
         process = processes.start("drive", "drive", "--no-browser", "--out", str(tmp_path / "out"), *settings)
         drive = PersonDrive(process, process.wait_ready()["ready"]["console"], browser, tmp_path / "out")
         try:

@@ -88,15 +88,21 @@ class FirefoxTab:
 
     def key(self, code: str, *, down: bool) -> None:
         """Press or release a key."""
-        self._perform("key", {"type": "keyDown" if down else "keyUp", "value": KEYS.get(code, code[-1])})
+        self.keys({code: down})
+
+    def keys(self, downs: Mapping[str, bool]) -> None:
+        """Press or release several keys at once, each of a keyboard of its own: a call takes 50 ms or more."""
+        values = {code: {"value": KEYS.get(code, code[-1])} for code in downs}
+        actions = [
+            {"type": "key", "id": code, "actions": [{"type": "keyDown" if down else "keyUp", **values[code]}]}
+            for code, down in downs.items()
+        ]
+        self.call("input.performActions", context=self._context, actions=actions)
 
     def point(self, x: int = 300, y: int = 200) -> None:
         """Move the pointer to a place over the page."""
-        self._perform("pointer", {"type": "pointerMove", "x": x, "y": y})
-
-    def _perform(self, device: str, *steps: dict[str, Any]) -> None:
-        actions = [{"type": device, "id": device, "actions": list(steps)}]
-        self.call("input.performActions", context=self._context, actions=actions)
+        action = {"type": "pointer", "id": "pointer", "actions": [{"type": "pointerMove", "x": x, "y": y}]}
+        self.call("input.performActions", context=self._context, actions=[action])
 
 
 @contextmanager
