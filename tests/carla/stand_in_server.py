@@ -23,7 +23,7 @@ import msgpack
 from tests.carla import carla_wire as wire
 from tests.carla.stand_in_world import ASYNCHRONOUS_DT_S, Refused, StandInWorld
 
-from lavt.domain import CameraModel
+from lavt.domain import NS_PER_S, CameraModel
 from lavt.vehicle.sim.road.road import load_road
 
 MAP_FILE = "OpenDrive"
@@ -62,7 +62,9 @@ class StandInServer:
         self._world, self._version = world, version
         self._lock = threading.Lock()
         self._tick_times_ns: list[int] = []
-        """When each tick of a client began."""
+        """When each tick began."""
+        self._pace = 1.0
+        """How much faster than the clock an asynchronous world runs."""
         self._methods: dict[str, Callable[..., Any]] = {
             "version": lambda: wire.value(self._version),
             "get_episode_info": lambda: wire.value([world.episode, [world.sensor_token(wire.WORLD_STREAM)]]),
@@ -110,15 +112,18 @@ class StandInServer:
                     return
 
     def run_asynchronously(self) -> None:
-        """Tick in real time as long as the world is not synchronous."""
-        last_s = time.monotonic()
+        """Tick in real time as long as the world is not synchronous; elapsed time follows the clock exactly."""
+        last_ns = time.monotonic_ns()
+        due_s = last_ns / NS_PER_S
         while True:
-            time.sleep(ASYNCHRONOUS_DT_S)
-            now_s = time.monotonic()
+            due_s = max(due_s + ASYNCHRONOUS_DT_S, time.monotonic())
+            time.sleep(max(0.0, due_s - time.monotonic()))
             with self._lock:
+                now_ns = time.monotonic_ns()
                 if not self._world.is_synchronous:
-                    self._world.tick(now_s, now_s - last_s)
-            last_s = now_s
+                    self._tick_times_ns.append(now_ns)
+                    self._world.tick(now_ns / NS_PER_S, (now_ns - last_ns) / NS_PER_S * self._pace)
+            last_ns = now_ns
 
     def report(self, command: list[str]) -> str:
         """Return the answer to a test's command on standard input."""
@@ -135,6 +140,9 @@ class StandInServer:
                     return "parked"
                 case ["tick_times"]:
                     return " ".join(map(str, self._tick_times_ns))
+                case ["pace", factor]:
+                    self._pace = float(factor)
+                    return "set"
                 case ["frame"]:
                     return str(world.frame)
                 case ["speed"]:

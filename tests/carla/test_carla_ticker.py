@@ -13,7 +13,8 @@ from lavt.domain import NS_PER_MS, Actuation, CameraModel
 from lavt.vehicle.carla.camera import CarlaCamera
 from lavt.vehicle.carla.frames import FlatPose
 from lavt.vehicle.carla.settings import CarlaEvent, Snapshot
-from lavt.vehicle.carla.ticker import FULL_BRAKE, CommandHistory, Ticker
+from lavt.vehicle.carla.ticker import CommandHistory, Ticker
+from lavt.vehicle.carla.ticks import FULL_BRAKE
 
 START_NS = 1_000 * NS_PER_MS
 PERIOD_S = 0.1

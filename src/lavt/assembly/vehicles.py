@@ -22,7 +22,9 @@ from lavt.perception.lane_detector import GRID
 from lavt.streams import stream
 from lavt.vehicle.camera import Camera, FrameTimes, TimedCamera
 from lavt.vehicle.carla.camera import CarlaCamera
+from lavt.vehicle.carla.follower import Follower
 from lavt.vehicle.carla.frames import FlatPose
+from lavt.vehicle.carla.guard import Guard
 from lavt.vehicle.carla.session import BRAKED, CarlaSession
 from lavt.vehicle.carla.settings import CarlaSettings
 from lavt.vehicle.carla.ticker import Ticker
@@ -102,16 +104,23 @@ def build_carla(config: ServerConfig) -> VehicleSetup:
         phase_ns=phase_ns,
         sensor_delay_ns=round(config.camera.sensor_delay_ms * NS_PER_MS),
     )
-    tickers: list[Ticker] = []
+    tickers: list[Ticker | Follower] = []
+    guards: list[Guard] = []
 
     def start(now: Now) -> Vehicle:
+        limit_s = config.vehicle.time_limit_s
+        if settings.is_asynchronous:
+            guards.append(Guard(settings, session.car_number))
+            follower = Follower(session, beat=guards[0].beat)
+            camera.ticker = follower
+            tickers.append(follower)
+            return CarlaVehicle(session, follower, road, car_of(config.vehicle), start_ns=now.mono_ns, limit_s=limit_s)
         period_ns = round(settings.tick_s * NS_PER_S)
         # The ticks include the times of all frames; the first is the first one after the start.
         first_ns = now.mono_ns + phase_ns - phase_ns // period_ns * period_ns
         ticker = Ticker(session, first_due_ns=first_ns, period_s=settings.tick_s, actuation=BRAKED)
         camera.ticker = ticker
         tickers.append(ticker)
-        limit_s = config.vehicle.time_limit_s
         return CarlaVehicle(session, ticker, road, car_of(config.vehicle), start_ns=now.mono_ns, limit_s=limit_s)
 
     def run(clock: Clock) -> None:
@@ -122,6 +131,8 @@ def build_carla(config: ServerConfig) -> VehicleSetup:
         for ticker in tickers:
             ticker.stop()
         session.close()
+        for guard in guards:  # last: until here it brakes if this process dies
+            guard.end()
 
     route = route_of(config.vehicle.route, road)
     return VehicleSetup(camera, start, route, simulated=True, run=run, close=close)
@@ -154,6 +165,7 @@ def carla_settings(config: ServerConfig, road: Road | None) -> CarlaSettings:
         camera=camera_model(camera),
         timeout_s=carla.timeout_s,
         tick_timeout_s=carla.tick_timeout_s,
+        is_asynchronous=carla.asynchronous,
         max_steering_rad=None if carla.max_steering_deg is None else math.radians(carla.max_steering_deg),
     )
 

@@ -27,6 +27,8 @@ class CarlaConfig(Section):
     start: tuple[float, float, float] | None = None
     """The start of the rear axle on the road: x, y (m) and heading (degrees, positive to the left); null: the route's
     start, with an offset from the seed as in the simulator."""
+    asynchronous: bool = False
+    """Whether the world runs by itself instead of being ticked: in real time only (`docs/carla.md`)."""
     ticks_per_frame: int = Field(1, ge=1, le=8)
     """How many ticks of the world there are for each frame of the camera; a tick is at most 0.1 s long."""
     max_steering_deg: float | None = Field(None, gt=0, lt=90)

@@ -74,6 +74,11 @@ def plan_run(
         raise UserError(
             f"fidelity {config.fidelity} is for virtual time only: choose fidelity video for real time, or time virtual"
         )
+    if config.time == "virtual" and config.vehicle.kind == "carla" and config.vehicle.carla.asynchronous:
+        raise UserError(
+            "vehicle.carla.asynchronous needs time real, because the world then runs by itself: set it, or leave out "
+            "vehicle.carla.asynchronous"
+        )
     seed = run_seed(config.seed, config.vehicle.route, config.repetition)
     identity = {
         "run": name,

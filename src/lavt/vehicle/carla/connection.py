@@ -111,6 +111,8 @@ def open_world(carla: Any, client: Any, settings: CarlaSettings) -> OpenedWorld:
             may_run = True
             if weather is not None:
                 world.set_weather(weather)
+            if settings.is_asynchronous:  # only now, because a killed run's car could drive on
+                world.apply_settings(_asynchronous(carla, world.get_settings()))
         except BaseException:
             if may_run:  # a world that was found frozen may hold the car of a killed run, which would drive on
                 with suppress(RuntimeError):
@@ -162,6 +164,15 @@ def _own_settings(carla: Any, before: Any, settings: CarlaSettings) -> Any:
     own.max_substeps = min(MAX_SUBSTEPS, max(MIN_SUBSTEPS, math.ceil(settings.tick_s / SUBSTEP_S)))
     own.no_rendering_mode = False
     return own
+
+
+def _asynchronous(carla: Any, own: Any) -> Any:
+    """Return settings with which the world runs by itself, in the time of its machine."""
+    running = _copied(carla, own)
+    running.synchronous_mode = False
+    running.fixed_delta_seconds = None
+    running.max_substeps = MAX_SUBSTEPS
+    return running
 
 
 def _settings_to_restore(carla: Any, found: Any) -> Any:

@@ -55,6 +55,17 @@ class PictureBox:
                 del self._pictures[older]
             return picture
 
+    def take_newest(self, timeout_s: float) -> tuple[int, Picture] | None:
+        """Return the newest picture with its frame, waiting for one at most `timeout_s`; older ones are dropped."""
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._pictures), timeout_s)
+            if not self._pictures:
+                return None
+            frame = max(self._pictures)
+            picture = self._pictures[frame]
+            self._pictures.clear()
+            return frame, picture
+
     def wait_for_any(self, timeout_s: float) -> bool:
         """Wait until there is a picture; return whether there is one."""
         with self._changed:

@@ -1,7 +1,8 @@
 """A car with its sensors in a CARLA server: spawn them, tick, and leave the server as it was.
 
-The world is synchronous: it stands still unless this client ticks it. So a dead client leaves a frozen world and no
-driving car. The next session removes the actors of a killed one, which it finds by their role name.
+By default the world is synchronous: it stands still unless this client ticks it. So a dead client leaves a frozen world
+and no driving car. An asynchronous world runs by itself (`follower.py`). The next session removes the actors of a
+killed one, which it finds by their role name.
 """
 
 from __future__ import annotations
@@ -46,11 +47,14 @@ PICTURE_WAIT_S: Final = 0.25
 CLOSE_TIMEOUT_S: Final = 2.0
 BRAKED: Final = Actuation(0.0, 0.0, 1.0)
 MPS_TO_KMH: Final = 3.6
+STEER_DITHER: Final = 1e-6
+"""Two controls in turn differ by this much: the package does not send one that is equal to its last one, although
+the guard may have braked since."""
 COLLISION, LANE_INVASION, CAMERA = "sensor.other.collision", "sensor.other.lane_invasion", "sensor.camera.rgb"
 
 
 class CarlaSession:
-    """A car with its sensors, ticked by this client only.
+    """A car with its sensors, in a world that only this client ticks or, if it is asynchronous, that runs by itself.
 
     Raises `UserError` if the server is absent, of another version, ticked by another client, or has no such town, car
     or free start; raises `VehicleError` if it stops answering.
@@ -69,6 +73,7 @@ class CarlaSession:
         self._max_steering_rad = 1.0
         self._steering_curve: tuple[tuple[float, float], ...] = ()
         self._frame = 0
+        self._dither = 0.0
         self._start = FlatPose(0.0, 0.0, 0.0)
         self._client = connect(self._carla, settings)
         atexit.register(self.close)
@@ -100,10 +105,22 @@ class CarlaSession:
         """The car after the newest tick."""
         return self._snapshot
 
+    @property
+    def car_number(self) -> int:
+        """The number of the car among the server's actors."""
+        return int(self._car.id)
+
     def tick(self, actuation: Actuation, *, hand_brake: bool = False) -> Snapshot:
-        """Advance the world by one tick under an actuation and return the car after it."""
+        """Advance the world by one tick under an actuation and return the car after it.
+
+        An asynchronous world advances by itself; then wait for its next state.
+        """
+        if self.settings.is_asynchronous:
+            self.apply(actuation, hand_brake=hand_brake)
+            self._snapshot = self.wait_for_state()
+            return self._snapshot
         with sentences(self.settings, "complete a tick"):
-            self._apply(actuation, hand_brake=hand_brake)
+            self.apply(actuation, hand_brake=hand_brake)
             before, self._frame = self._frame, self._world.tick(self.settings.tick_timeout_s)
             self._snapshot = self._read()
         if before and self._frame != before + 1:
@@ -112,6 +129,46 @@ class CarlaSession:
                 "end the other client that ticks it"
             )
         return self._snapshot
+
+    def wait_for_state(self) -> Snapshot:
+        """Return the car in the next state of an asynchronous world; raise `VehicleError` if none comes.
+
+        The steering angle is that of the control in force: to ask for the wheels' own would stop all threads for as
+        long as the server needs to answer.
+        """
+        with sentences(self.settings, "send a state"):
+            state = self._world.wait_for_tick(self.settings.tick_timeout_s)
+            car = state.find(self._car.id)
+            if car is None and self._frame:
+                raise VehicleError(
+                    f"the car is gone from the CARLA server at {self.settings.address}: end the other client that "
+                    "destroyed it"
+                )
+            pose, velocity = CarlaPose(0.0, 0.0, 0.0), (0.0, 0.0)
+            if car is not None:
+                self._frame = state.frame
+                pose, vector = _pose(car.get_transform()), car.get_velocity()
+                velocity = (vector.x, vector.y)
+            control = self._car.get_control()
+        return Snapshot(
+            state.frame,
+            rear_axle_pose(pose, self._axles.rear_axle_m, self.settings.map_shift_m),
+            forward_speed_mps(velocity, pose.yaw_deg),
+            -control.steer * self._max_steering_rad * self._curve_factor(math.hypot(*velocity)),
+            control.gear,
+            state.timestamp.elapsed_seconds,
+        )
+
+    def ask_version(self) -> str:
+        """Return the server's version: its answer takes as long as the shortest request does."""
+        with sentences(self.settings, "say its version"):
+            return str(self._client.get_server_version())
+
+    @property
+    def town(self) -> str:
+        """The name of the loaded town."""
+        with sentences(self.settings, "name its town"):
+            return town_of(self._world)
 
     def take_events(self) -> list[CarlaEvent]:
         """Return the collisions and lane invasions that arrived since the last call."""
@@ -143,7 +200,7 @@ class CarlaSession:
                     actor.stop()
                     actor.destroy()  # whether it succeeds: another client may have destroyed it
                     continue
-                self._apply(BRAKED, hand_brake=True)
+                self.apply(BRAKED, hand_brake=True)
                 if not actor.destroy():
                     return
             if self._opened is not None:
@@ -261,15 +318,24 @@ class CarlaSession:
 
     # Driving.
 
-    def _apply(self, actuation: Actuation, *, hand_brake: bool) -> None:
-        factor = curve_at(self._steering_curve, self._car.get_velocity().length() * MPS_TO_KMH)
+    def apply(self, actuation: Actuation, *, hand_brake: bool = False) -> None:
+        """Put an actuation in force, without waiting for the server."""
+        factor = self._curve_factor(self._car.get_velocity().length())
+        steer = steer_for(actuation.steering_rad, self._max_steering_rad, factor)
+        if self.settings.is_asynchronous:
+            self._dither = STEER_DITHER - self._dither
+            steer -= math.copysign(self._dither, steer)
         control = self._carla.VehicleControl(
             throttle=actuation.throttle,
-            steer=steer_for(actuation.steering_rad, self._max_steering_rad, factor),
+            steer=steer,
             brake=actuation.brake,
             hand_brake=hand_brake,
         )
         self._car.apply_control(control)
+
+    def _curve_factor(self, speed_mps: float) -> float:
+        """Return the factor by which the server multiplies the steer at a speed."""
+        return curve_at(self._steering_curve, speed_mps * MPS_TO_KMH)
 
     def _read(self) -> Snapshot:
         wheel = self._carla.VehicleWheelLocation

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from msgspec import Struct
 
@@ -32,6 +33,8 @@ class CarlaSettings:
     load_timeout_s: float = 120.0
     max_steering_rad: float | None = None
     """None: the angle that the server announces."""
+    is_asynchronous: bool = False
+    """Whether the world runs by itself."""
 
     @property
     def address(self) -> str:
@@ -40,10 +43,10 @@ class CarlaSettings:
 
 
 class CarlaEvent(Struct, frozen=True):
-    """A collision or a lane invasion."""
+    """A collision, a lane invasion, or a loss of time of an asynchronous world."""
 
     frame: int
-    kind: str
+    kind: Literal["collision", "lane_invasion", "late"]
     detail: str
 
 
@@ -57,3 +60,5 @@ class Snapshot(Struct, frozen=True):
     steering_rad: float
     gear: int
     """-1 is reverse."""
+    elapsed_s: float = 0.0
+    """The time that has elapsed in the world; 0 in a synchronous world, whose ticks have due times."""

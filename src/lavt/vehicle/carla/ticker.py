@@ -17,17 +17,12 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Final, Protocol
 
-from msgspec import Struct
-
 from lavt.clock import Clock
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.vehicle.carla.settings import CarlaEvent, Snapshot
+from lavt.vehicle.carla.ticks import FULL_BRAKE, ActuatorWatch, Ticked, TickHistory
 
-REMEMBERED_TICKS: Final = 64
 LATE_NS: Final = 2 * NS_PER_MS
-SILENCE_NS: Final = 200 * NS_PER_MS
-"""If the actuator has not looked for ticks for this long, the thread brakes the car; it looks every 5 ms."""
-FULL_BRAKE: Final = Actuation(0.0, 0.0, 1.0)
 
 
 class World(Protocol):
@@ -40,13 +35,6 @@ class World(Protocol):
     def take_events(self) -> list[CarlaEvent]:
         """Return the events since the last call."""
         ...
-
-
-class Ticked(Struct, frozen=True):
-    """The car after a tick, with the tick's due time."""
-
-    due_ns: int
-    snapshot: Snapshot
 
 
 class CommandHistory:
@@ -80,28 +68,23 @@ class CommandHistory:
         return Actuation(steering, min(throttle, 1.0), min(brake, 1.0))
 
 
-class Ticker:
+class Ticker(TickHistory):
     """Ticks at `first_due_ns` and then every `period_s`. All methods may be called from any thread."""
 
     def __init__(self, world: World, *, first_due_ns: int, period_s: float, actuation: Actuation) -> None:
+        super().__init__()
         self._world = world
         self._anchor_ns, self._count = first_due_ns, 0
         self._period_s = period_s
-        self._lock = threading.Lock()
         self._commands = CommandHistory(actuation, first_due_ns - self._period_ns)
         self._last_due_ns = first_due_ns - self._period_ns
         self._hand_brake = True
-        self._ticked: deque[Ticked] = deque(maxlen=REMEMBERED_TICKS)
-        self._events: list[tuple[int, CarlaEvent]] = []
-        self._counts = Counter({"ticks": 0, "ticks_begun_late": 0, "ticks_skipped": 0, "silences": 0})
+        self._counts = Counter({"ticks": 0, "ticks_begun_late": 0, "ticks_skipped": 0})
         self._is_threaded = False
-        self._heard_ns: int | None = None
-        """When the actuator last looked for ticks of the thread; None: it has not yet."""
-        self._is_silent = False
+        self._watch = ActuatorWatch()
         self._stopped = threading.Event()
         self._failed: BaseException | None = None
         self._thread: threading.Thread | None = None
-        self._changed = threading.Condition(self._lock)
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -109,7 +92,7 @@ class Ticker:
 
         A tick is late if it began more than `LATE_NS` after its due time.
         """
-        return dict(self._counts)
+        return {**self._counts, "silences": self._watch.silences}
 
     @property
     def is_threaded(self) -> bool:
@@ -137,7 +120,7 @@ class Ticker:
         Raises `VehicleError`.
         """
         if self._is_threaded:
-            self._heard_ns = to_ns
+            self._watch.hear(to_ns)
             if self._failed is not None:
                 raise self._failed
             return
@@ -145,34 +128,9 @@ class Ticker:
             self._tick(self.next_due_ns)
 
     def brake_if_silent(self, now_ns: int) -> None:
-        """Brake fully in the next tick if the actuator has not looked for ticks for `SILENCE_NS`."""
-        heard_ns = self._heard_ns
-        was_silent, self._is_silent = self._is_silent, heard_ns is not None and now_ns - heard_ns > SILENCE_NS
-        if self._is_silent:
-            self._counts["silences"] += not was_silent
+        """Brake fully in the next tick if the actuator is silent."""
+        if self._watch.is_silent(now_ns):
             self.command(FULL_BRAKE, self._last_due_ns, hand_brake=False)
-
-    def ticked_at(self, at_ns: int) -> Ticked | None:
-        """Return the newest tick that was due by `at_ns`; None if it is forgotten or there was none."""
-        with self._lock:
-            return next((ticked for ticked in reversed(self._ticked) if ticked.due_ns <= at_ns), None)
-
-    def wait_for_tick(self, after_ns: int, timeout_s: float) -> Ticked | None:
-        """Return the newest tick if it was due after `after_ns`, waiting for it; None if none came in time."""
-        with self._changed:
-            self._changed.wait_for(lambda: bool(self._ticked) and self._ticked[-1].due_ns > after_ns, timeout_s)
-            return self._ticked[-1] if self._ticked and self._ticked[-1].due_ns > after_ns else None
-
-    def take_events(self) -> list[tuple[int, CarlaEvent]]:
-        """Return the events since the last call, each with the due time of its tick, in order of time."""
-        with self._lock:
-            events, self._events = self._events, []
-        return sorted(events, key=lambda event: event[0])
-
-    def take_ticks(self, after_ns: int) -> list[Ticked]:
-        """Return the remembered ticks that were due after `after_ns`."""
-        with self._lock:
-            return [ticked for ticked in self._ticked if ticked.due_ns > after_ns]
 
     def start(self, clock: Clock) -> None:
         """Start the thread that makes the ticks in real time."""
@@ -217,12 +175,8 @@ class Ticker:
         with self._lock:
             actuation, hand_brake = self._commands.mean(self._last_due_ns, due_ns), self._hand_brake
         snapshot = self._world.tick(actuation, hand_brake=hand_brake)
-        with self._changed:
+        with self._lock:
             self._last_due_ns = due_ns
             self._count += 1
             self._counts["ticks"] += 1
-            self._ticked.append(Ticked(due_ns, snapshot))
-            due_of_frame = {ticked.snapshot.frame: ticked.due_ns for ticked in self._ticked}
-            for event in self._world.take_events():
-                self._events.append((due_of_frame.get(event.frame, due_ns), event))
-            self._changed.notify_all()
+        self.add(Ticked(due_ns, snapshot), self._world.take_events())

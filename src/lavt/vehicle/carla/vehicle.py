@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, EventKind, GroundTruth, VehicleEvent, VehicleState
+from lavt.vehicle.carla.follower import Follower
 from lavt.vehicle.carla.session import BRAKED, CarlaSession
 from lavt.vehicle.carla.ticker import Ticker
 from lavt.vehicle.sim.dynamics import CarMotion, CarParameters
@@ -26,12 +27,15 @@ FROZEN_NS: Final = NS_PER_S // 2
 
 
 class CarlaVehicle:
-    """A `Vehicle` whose world the ticker advances; the route monitor gives the ground truth on the road."""
+    """A `Vehicle` in a world that the ticker advances or the follower follows.
+
+    The route monitor gives the ground truth on the road.
+    """
 
     def __init__(
         self,
         session: CarlaSession,
-        ticker: Ticker,
+        ticker: Ticker | Follower,
         road: Road,
         parameters: CarParameters,
         *,
@@ -56,7 +60,7 @@ class CarlaVehicle:
         """The properties of this vehicle."""
         return Capabilities(
             simulated=True,
-            virtual_time=True,
+            virtual_time=not self._session.settings.is_asynchronous,
             ground_truth=True,
             reset=False,
             wheelbase_m=self._session.wheelbase_m,
@@ -85,7 +89,7 @@ class CarlaVehicle:
             events += [event for event in self._monitor.update(self._motion, self._at_ns) if event.kind in MONITORED]
         for at_ns, event in self._ticker.take_events():
             if event.kind != "collision":
-                events.append(VehicleEvent(at_ns, "lane_invasion", event.detail))
+                events.append(VehicleEvent(at_ns, event.kind, event.detail))
                 continue
             if self._contact_ns is None or at_ns - self._contact_ns > CONTACT_GAP_NS:
                 events.append(VehicleEvent(at_ns, "collision", event.detail))

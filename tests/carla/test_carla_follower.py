@@ -1,0 +1,216 @@
+"""A CARLA world that runs by itself: the times of its states, the commands, and who brakes; no server is needed."""
+
+from __future__ import annotations
+
+import os
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.config import RunConfig
+from lavt.config_file import parse_config
+from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, Now
+from lavt.errors import UserError
+from lavt.experiment.runs.plan import plan_run
+from lavt.vehicle.carla import guard as guarding
+from lavt.vehicle.carla.follower import CALIBRATION_TICKS, RESEND_NS, Follower
+from lavt.vehicle.carla.frames import FlatPose
+from lavt.vehicle.carla.settings import CarlaEvent, Snapshot
+from lavt.vehicle.carla.ticks import SILENCE_NS
+from lavt.vehicle.carla.world_time import WINDOW_NS, WorldTime
+
+START_NS = 5 * NS_PER_S
+THROTTLE = Actuation(0.1, 0.5, 0.0)
+DELAYS_MS = st.lists(st.floats(1.0, 30.0), min_size=5, max_size=60)
+
+
+class RecordedWorld:
+    """A world that records what is applied."""
+
+    def __init__(self) -> None:
+        self.applied: list[tuple[Actuation, bool]] = []
+        self.events: list[CarlaEvent] = []
+
+    def apply(self, actuation: Actuation, *, hand_brake: bool = False) -> None:
+        """Record the actuation."""
+        self.applied.append((actuation, hand_brake))
+
+    def wait_for_state(self) -> Snapshot:
+        """Never called, because no thread runs."""
+        raise AssertionError
+
+    def take_events(self) -> list[CarlaEvent]:
+        """Return the events since the last call."""
+        events, self.events = self.events, []
+        return events
+
+
+class FixedClock:
+    """A clock that stands still."""
+
+    def now(self) -> Now:
+        """Return the start."""
+        return Now(START_NS, 0)
+
+
+def snapshot(frame: int, elapsed_s: float) -> Snapshot:
+    return Snapshot(frame, FlatPose(0.0, 0.0, 0.0), 0.0, 0.0, 1, elapsed_s)
+
+
+def follow(follower: Follower, world_s: float, clock_s: float, *, count: int, first: int = 1) -> None:
+    """Let states arrive that are `world_s` apart in the world, and `clock_s` apart on the clock."""
+    for number in range(first, first + count):
+        follower.note(snapshot(number, 100 + number * world_s), START_NS + round(number * clock_s * NS_PER_S))
+
+
+@given(DELAYS_MS)
+def test_a_state_is_at_most_as_old_as_its_delay(delays_ms: list[float]) -> None:
+    """A state's time is between its true time and its arrival, and its error is the smallest delay so far."""
+    times, smallest_ms = WorldTime(), 1e9
+    for number, delay_ms in enumerate(delays_ms):
+        true_ns = START_NS + number * 10 * NS_PER_MS
+        arrived_ns = max(true_ns + round(delay_ms * NS_PER_MS), START_NS)
+        smallest_ms = min(smallest_ms, delay_ms)
+        found_ns = times.state_ns(true_ns - START_NS, arrived_ns)
+        assert true_ns <= found_ns <= arrived_ns
+        assert found_ns - true_ns == pytest.approx(smallest_ms * NS_PER_MS, abs=2)
+
+
+def test_a_world_that_lost_time_is_followed() -> None:
+    """A second after a world stood still for 80 ms, its states have their true times again, and 80 ms were reported."""
+    times, drifts = WorldTime(), 0
+    for number in range(400):
+        elapsed_ns = number * 10 * NS_PER_MS
+        lost_ns = 80 * NS_PER_MS if number >= 100 else 0
+        state_ns = times.state_ns(elapsed_ns, START_NS + elapsed_ns + lost_ns)
+        drifts += times.take_drift_ns()
+        if number > 100 + WINDOW_NS // (10 * NS_PER_MS) + 1:
+            assert state_ns == START_NS + elapsed_ns + lost_ns
+    assert drifts == 80 * NS_PER_MS
+
+
+@pytest.mark.parametrize(("pace", "is_late"), [(1.0, False), (0.97, True), (1.03, True)])
+def test_a_world_at_another_pace_is_late(pace: float, is_late: bool) -> None:
+    """A world that runs 3 % slower or faster than the clock reports that share of the time as late."""
+    follower = Follower(RecordedWorld())
+    follow(follower, 0.02 * pace, 0.02, count=1000)
+    late_ms = [int(event.detail.removesuffix(" ms")) for _, event in follower.take_events() if event.kind == "late"]
+    assert sum(late_ms) == pytest.approx(0.03 * 20_000 if is_late else 0.0, rel=0.1)
+
+
+def test_the_first_states_only_give_the_time() -> None:
+    """The first states are not used; of the others, times increase, and frames that did not arrive are counted."""
+    follower = Follower(RecordedWorld())
+    follow(follower, 0.02, 0.02, count=CALIBRATION_TICKS)
+    assert follower.take_ticks(0) == []
+    follow(follower, 0.02, 0.02, count=5, first=CALIBRATION_TICKS + 4)
+    ticked = follower.take_ticks(0)
+    assert len(ticked) == 5
+    assert all(first.due_ns < second.due_ns for first, second in pairwise(ticked))
+    assert follower.counts["states_missed"] == 3
+    found = follower.wait_for_frame(CALIBRATION_TICKS + 5, 0.0)
+    assert found == ticked[1]
+    assert follower.wait_for_frame(CALIBRATION_TICKS + 3, 0.0) is None
+
+
+def test_a_command_is_sent_at_once_and_repeated() -> None:
+    """A new command is sent when it comes, and again after a while, because the guard may have braked."""
+    world, beats = RecordedWorld(), []
+    follower = Follower(world, beat=lambda: beats.append(1))
+    for after_ns, count in ((0, 1), (1, 1), (RESEND_NS - 1, 1), (RESEND_NS, 2), (RESEND_NS + 1, 2)):
+        follower.tick_until(START_NS + after_ns)
+        follower.send(START_NS + after_ns)
+        assert len(world.applied) == count
+    follower.command(THROTTLE, START_NS, hand_brake=False)
+    follower.send(START_NS + RESEND_NS + 2)
+    assert world.applied[-1] == (THROTTLE, False)
+    assert len(beats) == 6
+
+
+def test_a_car_is_braked_when_the_actuator_is_silent() -> None:
+    """If the actuator does not look for states for more than 200 ms, the car brakes along its last steering angle."""
+    world = RecordedWorld()
+    follower = Follower(world)
+    follower.tick_until(START_NS)
+    follower.command(THROTTLE, START_NS, hand_brake=False)
+    for after_ns, sent in ((0, THROTTLE), (SILENCE_NS, THROTTLE), (SILENCE_NS + 1, Actuation(0.1, 0.0, 1.0))):
+        follower.send(START_NS + after_ns)
+        assert world.applied[-1] == (sent, False)
+    assert follower.counts["silences"] == 1
+    follower.tick_until(START_NS + SILENCE_NS + 2)
+    follower.send(START_NS + SILENCE_NS + 2)
+    assert world.applied[-1] == (THROTTLE, False)
+
+
+def test_a_failed_thread_fails_the_actuator() -> None:
+    """An error of the guard, or of the server, is raised when the actuator next looks for states."""
+
+    def no_guard() -> None:
+        raise UserError("the guard has ended")
+
+    follower = Follower(RecordedWorld(), beat=no_guard)
+    follower._send(clock=FixedClock())
+    with pytest.raises(UserError, match="the guard has ended"):
+        follower.tick_until(START_NS)
+
+
+def guard_with(speeds_mps: list[float], *texts: bytes) -> int:
+    """Run the guard's loop on a pipe with some texts, which is then closed; return how often it braked."""
+    reading, writing = os.pipe()
+    left = list(speeds_mps)
+    brakings = []
+
+    def brake() -> bool:
+        brakings.append(1)
+        return (left.pop(0) if left else 0.0) == 0.0
+
+    for text in texts:
+        os.write(writing, text)
+    os.close(writing)
+    try:
+        guarding.guard(reading, brake)
+    finally:
+        os.close(reading)
+    return len(brakings)
+
+
+def test_the_guard_does_not_brake_after_a_farewell() -> None:
+    """A guard that was told to end does not touch the car."""
+    assert guard_with([5.0], guarding.BEAT * 3, guarding.FAREWELL) == 0
+
+
+def test_the_guard_brakes_a_dead_process_to_standstill(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a farewell, the guard brakes until the car is stationary, at least for a second, at most for a minute."""
+    monkeypatch.setattr(guarding, "pause", lambda _: None)
+    assert guard_with([], guarding.BEAT) == guarding.MIN_BRAKINGS
+    assert guard_with([5.0] * 30, guarding.BEAT) == 31
+    assert guard_with([5.0] * 9999, guarding.BEAT) == guarding.MAX_BRAKINGS
+
+
+def test_the_guard_brakes_a_silent_process_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a process writes nothing the guard brakes again and again; when it writes again, the guard waits again."""
+    monkeypatch.setattr(guarding, "BEAT_TIMEOUT_S", 0.0)
+    monkeypatch.setattr(guarding, "REPEAT_S", 0.0)
+    reading, writing = os.pipe()
+    brakings = [0]
+
+    def brake() -> bool:
+        brakings.append(brakings[-1] + 1)
+        if brakings[-1] == 3:
+            os.write(writing, guarding.BEAT)
+            os.write(writing, guarding.FAREWELL)
+        return False
+
+    guarding.guard(reading, brake)
+    assert brakings[-1] == 3
+    for end in (reading, writing):
+        os.close(end)
+
+
+def test_an_asynchronous_world_needs_real_time() -> None:
+    """A run in virtual time with a world that runs by itself is refused, with what to set."""
+    settings = {"vehicle": {"kind": "carla", "carla": {"asynchronous": True}}, "time": "virtual"}
+    with pytest.raises(UserError, match="asynchronous needs time real"):
+        plan_run(parse_config(RunConfig, settings, "the test"))
