@@ -8,19 +8,20 @@ from collections.abc import Callable, Iterable
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from tests.carla.contract_vehicle import contract_vehicle
 from tests.nodes.stand_ins import MONO_NS, FakeVehicle
 
 from lavt.assembly.by_wire import build_inside
 from lavt.config import DbwConfig, ServerConfig, VehicleConfig
-from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, Now
+from lavt.domain import NS_PER_S, Actuation, Now, VehicleState
+from lavt.vehicle import contract
+from lavt.vehicle.contract import ContractLimits
 from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.vehicle import Vehicle
 
 ROAD = load_road("a_key")
-MAX_PERIOD_NS = 20 * NS_PER_MS
-BRAKE = Actuation(0.0, 0.0, 1.0)
 
 
 def by_wire(profile: str) -> Vehicle:
@@ -49,56 +50,22 @@ def each_of(vehicles: Iterable[str]) -> pytest.MarkDecorator:
 each_vehicle, each_drivable = each_of(VEHICLES), each_of(DRIVABLE)
 
 
-def run(vehicle: Vehicle, start_ns: int, actuation: Actuation, *, should_engage: bool, seconds: float) -> int:
-    """Call the vehicle as the actuator node does, at each wake time, and return the end time."""
-    now_ns, end_ns = start_ns, start_ns + round(seconds * NS_PER_S)
-    while now_ns < end_ns:
-        vehicle.advance(now_ns)
-        vehicle.engage(should_engage, now_ns)
-        vehicle.apply(actuation, now_ns)
-        now_ns = min(max(vehicle.next_wake_ns(), now_ns + 1), now_ns + MAX_PERIOD_NS, end_ns)
-    vehicle.advance(end_ns)
-    return end_ns
-
-
 @each_vehicle
 def test_state_times_and_wake_times(name: str) -> None:
     """A state's time never decreases and never exceeds the time of `advance`; the next wake is after the state."""
-    vehicle = VEHICLES[name]()
-    vehicle.advance(MONO_NS + 20 * NS_PER_MS)
-    before_ns, latest_ms = vehicle.state().mono_ns, 20
-    for offset_ms in (20, 21, 21, 40, 500, 400, 501):
-        vehicle.advance(MONO_NS + offset_ms * NS_PER_MS)
-        latest_ms = max(latest_ms, offset_ms)
-        assert before_ns <= vehicle.state().mono_ns <= MONO_NS + latest_ms * NS_PER_MS
-        before_ns = vehicle.state().mono_ns
-        assert vehicle.next_wake_ns() > before_ns
-    while vehicle.next_wake_ns() <= MONO_NS + 601 * NS_PER_MS:
-        vehicle.advance(vehicle.next_wake_ns())
-    assert vehicle.state().mono_ns > before_ns
+    assert contract.check_times(VEHICLES[name](), MONO_NS) == []
 
 
 @each_vehicle
 def test_a_vehicle_is_stationary_until_commanded(name: str) -> None:
     """Without a command the vehicle is stationary and has no events."""
-    vehicle = VEHICLES[name]()
-    assert vehicle.advance(MONO_NS + 3 * NS_PER_S) == []
-    assert vehicle.state().speed_mps == 0
+    assert contract.check_rest(VEHICLES[name](), MONO_NS) == []
 
 
 @each_vehicle
 def test_capabilities(name: str) -> None:
     """Sizes and limits are positive and finite, and there is ground truth if and only if the capabilities say so."""
-    vehicle = VEHICLES[name]()
-    capabilities = vehicle.capabilities
-    for value in (
-        capabilities.wheelbase_m,
-        capabilities.max_steering_rad,
-        capabilities.max_acceleration_mps2,
-        capabilities.max_braking_mps2,
-    ):
-        assert 0 < value < math.inf
-    assert (vehicle.ground_truth() is not None) == capabilities.ground_truth
+    assert contract.check_capabilities(VEHICLES[name](), MONO_NS) == []
 
 
 @each_vehicle
@@ -106,46 +73,88 @@ def test_capabilities(name: str) -> None:
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(0, 1), st.floats(0, 1), st.integers(1, 800)), max_size=6))
 def test_any_actuation_leaves_a_finite_state(name: str, requested: list[tuple[float, float, float, int]]) -> None:
     """Any actuations within their ranges leave a finite state and a steering angle within the limits."""
-    vehicle, now_ns = VEHICLES[name](), MONO_NS
-    for steering_rad, throttle, brake, duration_ms in requested:
-        vehicle.apply(Actuation(steering_rad, throttle, brake), now_ns)
-        now_ns += duration_ms * NS_PER_MS
-        events = vehicle.advance(now_ns)
-        assert [event.mono_ns for event in events] == sorted(event.mono_ns for event in events)
-        state = vehicle.state()
-        assert math.isfinite(state.speed_mps)
-        assert abs(state.steering_rad) <= vehicle.capabilities.max_steering_rad + 1e-9
+    assert contract.check_actuations(VEHICLES[name](), MONO_NS, requested) == []
 
 
 @each_drivable
 def test_an_engaged_vehicle_follows_commands(name: str) -> None:
     """A stationary, braked vehicle engages within 3 s, and then accelerates and turns as commanded."""
-    vehicle = DRIVABLE[name]()
-    now_ns = run(vehicle, MONO_NS, BRAKE, should_engage=False, seconds=0.5)
-    assert vehicle.state().inhibit_reason == ""
-    now_ns = run(vehicle, now_ns, BRAKE, should_engage=True, seconds=3)
-    state = vehicle.state()
-    assert (state.is_engaged, state.inhibit_reason, state.is_overridden, state.gear) == (True, "", False, "drive")
-    run(vehicle, now_ns, Actuation(0.05, 0.5, 0.0), should_engage=True, seconds=2)
-    state = vehicle.state()
-    assert 1.0 < state.speed_mps < 2.0, "1 m/s2 for 2 s, minus the lags"
-    assert state.steering_rad == pytest.approx(0.05, abs=0.002)
-    truth = vehicle.ground_truth()
-    assert truth is not None
-    assert truth.steering_rad == pytest.approx(0.05, abs=0.002)
+    assert contract.check_following(DRIVABLE[name](), MONO_NS, ContractLimits()) == []
 
 
 @each_drivable
 def test_a_disengaged_vehicle_stays_stationary(name: str) -> None:
     """A driving vehicle that is disengaged and braked stops, and then remains stationary."""
-    vehicle = DRIVABLE[name]()
-    now_ns = run(vehicle, MONO_NS, BRAKE, should_engage=False, seconds=0.5)
-    now_ns = run(vehicle, now_ns, BRAKE, should_engage=True, seconds=3)
-    now_ns = run(vehicle, now_ns, Actuation(0.0, 1.0, 0.0), should_engage=True, seconds=2)
-    assert vehicle.state().speed_mps > 2
-    now_ns = run(vehicle, now_ns, BRAKE, should_engage=False, seconds=3)
-    assert vehicle.state().speed_mps == 0
-    run(vehicle, now_ns, BRAKE, should_engage=False, seconds=1)
-    truth = vehicle.ground_truth()
-    assert truth is not None
-    assert truth.speed_mps == 0
+    assert contract.check_disengaging(DRIVABLE[name](), MONO_NS, ContractLimits()) == []
+
+
+def simulator(start_ns: int) -> Simulator:
+    return Simulator(road=ROAD, seed=1, start_mono_ns=start_ns)
+
+
+class Crawling(Simulator):
+    """A car that moves without a command."""
+
+    def state(self) -> VehicleState:
+        """Return a state with a small speed."""
+        return replace(super().state(), speed_mps=0.01)
+
+
+class TimeTraveller(Simulator):
+    """A car whose states are ahead of time, so that its wakes are in the past."""
+
+    def state(self) -> VehicleState:
+        """Return a state of the future."""
+        state = super().state()
+        return replace(state, mono_ns=state.mono_ns + NS_PER_S)
+
+
+class Unlimited(Simulator):
+    """A car that reports a steering angle beyond its limit, and a speed that is no number."""
+
+    def state(self) -> VehicleState:
+        """Return an impossible state."""
+        return replace(super().state(), steering_rad=0.9, speed_mps=math.nan)
+
+
+class Deaf(Simulator):
+    """A car that executes no command and never engages."""
+
+    def apply(self, actuation: Actuation, now_ns: int) -> None:
+        """Do nothing."""
+
+    def state(self) -> VehicleState:
+        """Return a state that is not engaged."""
+        return replace(super().state(), is_engaged=False)
+
+
+class Brakeless(Simulator):
+    """A car whose brake does nothing."""
+
+    def apply(self, actuation: Actuation, now_ns: int) -> None:
+        """Apply all but the brake."""
+        super().apply(Actuation(actuation.steering_rad, actuation.throttle, 0.0), now_ns)
+
+
+FAULTS: dict[type[Simulator], set[str]] = {
+    Crawling: {"stationary until commanded", "stops when disengaged"},
+    TimeTraveller: {"times of states and wakes"},
+    Unlimited: {"any command leaves a finite state"},
+    Deaf: {"follows commands", "stops when disengaged"},
+    Brakeless: {"stops when disengaged"},
+}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_the_checks_find_faults(kind: type[Simulator]) -> None:
+    """A car with a fault fails the checks that are about it, with sentences."""
+    results = contract.check_contract(lambda start_ns: kind(road=ROAD, seed=1, start_mono_ns=start_ns), MONO_NS)
+    assert FAULTS[kind] <= {result.name for result in results if result.violations}
+
+
+def test_limits_are_those_of_a_vehicle() -> None:
+    """The built-in car passes all checks with the default limits, and fails those of a faster car."""
+    assert not [result for result in contract.check_contract(simulator, MONO_NS) if result.violations]
+    faster = ContractLimits(speed_mps=(3.0, 5.0), full_throttle_mps=6.0)
+    failed = {result.name for result in contract.check_contract(simulator, MONO_NS, faster) if result.violations}
+    assert failed == {"follows commands", "stops when disengaged"}

@@ -14,9 +14,15 @@ import numpy as np
 from msgspec import Struct
 
 from lavt.clock import Clock
-from lavt.domain import NS_PER_MS, Actuation
+from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.vehicle.carla.session import BRAKED, CarlaSession
 from lavt.vehicle.carla.settings import Snapshot
+from lavt.vehicle.carla.ticker import Ticker
+from lavt.vehicle.carla.vehicle import CarlaVehicle
+from lavt.vehicle.contract import ContractLimits, check_contract
+from lavt.vehicle.sim.dynamics import CarParameters
+from lavt.vehicle.sim.road.road import Road, parse_road
+from lavt.vehicle.vehicle import Vehicle
 
 CHECK_SPEED_MPS: Final = 5.0
 MAX_RUN_UP_S: Final = 10.0
@@ -28,14 +34,21 @@ STEERING_TOLERANCE: Final = 0.1
 """The relative difference between commanded and driven steering angle that the check accepts."""
 STATIONARY_MPS: Final = 0.05
 TIMED_TICKS: Final = 100
+CONTRACT_LIMITS: Final = ContractLimits(
+    speed_mps=(0.3, 15.0), full_throttle_mps=0.5, steering_tolerance_rad=0.02, stop_s=6.0
+)
+"""What any car of CARLA must do: LAVT was never tried with a real one, so the limits are wide."""
+CONTRACT_START_NS: Final = NS_PER_S
 
 
 class CarlaCheck(Struct, frozen=True):
     """One check with its result."""
 
     name: str
-    passed: bool
+    passed: bool | None
+    """None: the check could not be made."""
     detail: str
+    """What was measured or, if the check was not passed, the reason."""
 
 
 class StepSteer(Struct, frozen=True):
@@ -55,6 +68,31 @@ class TickTimes(Struct, frozen=True):
     """From the beginning of a tick until its picture has arrived."""
     picture_p95_ms: float
     pictures_missing: int
+    request_p50_ms: float
+    """The answer to the shortest request."""
+    request_p95_ms: float
+
+
+def check_vehicle_contract(session: CarlaSession, parameters: CarParameters) -> list[CarlaCheck]:
+    """Run the contract of vehicles, each check from the session's start, on a straight road that is made up there."""
+    road = _straight_road(session)
+
+    def build(start_ns: int) -> Vehicle:
+        session.reset()
+        session.take_events()
+        ticker = Ticker(session, first_due_ns=start_ns, period_s=session.settings.tick_s, actuation=BRAKED)
+        return CarlaVehicle(session, ticker, road, parameters, start_ns=start_ns)
+
+    return [
+        CarlaCheck(f"contract: {result.name}", not result.violations, "; ".join(result.violations) or "as LAVT assumes")
+        for result in check_contract(build, CONTRACT_START_NS, CONTRACT_LIMITS)
+    ]
+
+
+def _straight_road(session: CarlaSession) -> Road:
+    x_m, y_m, heading_rad = session.snapshot.pose
+    origin = f"{{x_m: {x_m:.4f}, y_m: {y_m:.4f}, heading_rad: {heading_rad:.6f}}}"
+    return parse_road(f"title: check\norigin: {origin}\nsegments: [{{length_m: 300}}]\n", "the road of the check")
 
 
 def check_driving(session: CarlaSession) -> list[CarlaCheck]:
@@ -117,12 +155,34 @@ def time_ticks(session: CarlaSession, clock: Clock, count: int = TIMED_TICKS) ->
             missing += 1
         else:
             pictures_ms.append((clock.now().mono_ns - begin_ns) / NS_PER_MS)
+    requests_ms = []
+    for _ in range(count):
+        begin_ns = clock.now().mono_ns
+        session.ask_version()
+        requests_ms.append((clock.now().mono_ns - begin_ns) / NS_PER_MS)
     return TickTimes(
         _percentile(ticks_ms, 50),
         _percentile(ticks_ms, 95),
         _percentile(pictures_ms, 50),
         _percentile(pictures_ms, 95),
         missing,
+        _percentile(requests_ms, 50),
+        _percentile(requests_ms, 95),
+    )
+
+
+def describe_times(times: TickTimes, tick_s: float) -> str:
+    """Return the measured times, and whether they suffice for driving in real time."""
+    verdict = "fast enough" if times.picture_p95_ms < tick_s * 1e3 else "too slow"
+    parts = {
+        "ticks take": (times.tick_p50_ms, times.tick_p95_ms),
+        "pictures arrive after": (times.picture_p50_ms, times.picture_p95_ms),
+        "requests take": (times.request_p50_ms, times.request_p95_ms),
+    }
+    measured = ", ".join(f"{text} {p50_ms:.1f} ms (p95 {p95_ms:.1f} ms)" for text, (p50_ms, p95_ms) in parts.items())
+    return (
+        f"{times.pictures_missing} pictures missing; {measured}; {verdict} for real time with a tick each "
+        f"{tick_s * 1e3:.1f} ms"
     )
 
 
