@@ -195,13 +195,13 @@ class CarlaSession:
         atexit.unregister(self.close)
         with suppress(RuntimeError):
             self._client.set_timeout(CLOSE_TIMEOUT_S)
+            if self._actors:  # before anything else, because a car in an asynchronous world drives on
+                self.apply(BRAKED, hand_brake=True)
             for actor in reversed(self._actors):
                 if actor.type_id.startswith("sensor."):
                     actor.stop()
                     actor.destroy()  # whether it succeeds: another client may have destroyed it
-                    continue
-                self.apply(BRAKED, hand_brake=True)
-                if not actor.destroy():
+                elif not actor.destroy():
                     return
             if self._opened is not None:
                 self._opened.restore(has_own_weather=bool(self.settings.weather))
