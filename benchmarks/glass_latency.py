@@ -45,7 +45,10 @@ FLOOR_AT_PX = (1100, 30)
 POLL_NS = 500 * NS_PER_US
 SETTLE_NS = NS_PER_S
 MAX_AGE_NS = 2 * NS_PER_S
-FIT = "document.querySelector('#picture').style = 'position: fixed; left: 0; top: 0; width: 640px; height: 480px; z-index: 9'; 0"
+FIT = """(() => {
+  const style = "position: fixed; left: 0; top: 0; width: 640px; height: 480px; z-index: 9";
+  document.querySelector("#picture").style = style;
+})()"""
 PLACE = """(() => {
   const canvas = document.querySelector("#picture");
   const box = canvas.getBoundingClientRect();
