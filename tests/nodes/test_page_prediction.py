@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from tests.nodes.stand_ins import MONO_NS, WALL_NS, at, payloads
 from tests.nodes.test_human_driver import HumanBench
 
-from lavt.control.loop_history import STATE_AGE_NS
-from lavt.control.prediction import CarModel, Prediction, RelativePose
+from lavt.control.loop_history import CLOCK_STEP_NS, STATE_AGE_NS
+from lavt.control.prediction import MAX_LOOP_NS, CarModel, Prediction, RelativePose
 from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, State
 from lavt.node import Send
 from lavt.nodes.page_prediction import Outline, PagePredictor, draw
@@ -137,6 +138,52 @@ def test_a_command_turns_the_ghost_as_long_as_it_acts(acting_ns: int) -> None:
     assert prediction is not None
     least, most = (turned_after(max(0, acting_ns + error_ns)) for error_ns in (-STEP_NS // 2, STEP_NS // 2))
     assert 0.99 * least <= prediction.ghost.heading_rad <= 1.01 * most
+
+
+def ghosts_after_setting_the_clock(step_ns: int, steps: int) -> list[float | None]:
+    """Return how far ahead of each picture the ghost is, one for each 20 ms since the vehicle's clock was set.
+
+    The car drives at 8 m/s, each command takes effect after `CONTROL_NS`, and each picture is `VIDEO_NS` old.
+    """
+    predictor, set_ns = PagePredictor(MODEL, OUTLINE, CAMERA), 50 * STEP_NS
+    ghosts: list[float | None] = []
+    for number in range(50 + steps):
+        now_ns = number * STEP_NS
+        predictor.history.note_command(number, 0.0, now_ns)
+        newest = state(now_ns, number - -(-CONTROL_NS // STEP_NS))
+        clock_ns = step_ns if now_ns >= set_ns else 0
+        predictor.history.note_state(replace(newest, sent_wall_ns=newest.sent_wall_ns + clock_ns), now_ns)
+        captured_ns = now_ns - VIDEO_NS
+        picture_ns = WALL_NS + captured_ns + (step_ns if captured_ns >= set_ns else 0)
+        prediction = predictor.predict_since(picture_ns, now_ns)
+        if now_ns >= set_ns:
+            ghosts.append(None if prediction is None else prediction.ghost.x_m)
+    return ghosts
+
+
+LOOP_M = 8.0 * (VIDEO_NS + CONTROL_NS) / NS_PER_S
+LOOP_TOLERANCE_M = 8.0 * 0.01 + 0.05
+
+
+@pytest.mark.parametrize("step_ms", [-10_000, -1_000, -200, -40, 40, 200, 1_000, 10_000])
+def test_a_clock_that_is_set_hides_the_prediction(step_ms: int) -> None:
+    """When the vehicle's clock is set, nothing is drawn at once, until the new clock has stamped picture and states."""
+    ghosts_m = ghosts_after_setting_the_clock(step_ms * NS_PER_MS, 300)
+    hidden_ns = STEP_NS * next(index for index, ghost_m in enumerate(ghosts_m) if ghost_m is not None)
+    # A clock that was set back must have passed the time that it had shown.
+    expected_ns = min(VIDEO_NS + max(0, -step_ms * NS_PER_MS), MAX_LOOP_NS)
+    assert expected_ns <= hidden_ns <= expected_ns + 2 * STEP_NS
+    for ghost_m in ghosts_m[hidden_ns // STEP_NS :]:
+        assert ghost_m == pytest.approx(LOOP_M, abs=LOOP_TOLERANCE_M)
+
+
+@pytest.mark.parametrize("step_ns", [-CLOCK_STEP_NS, CLOCK_STEP_NS])
+def test_a_step_of_the_clock_that_is_not_noticed_moves_the_ghost_little(step_ns: int) -> None:
+    """A smaller step of the clock moves the ghost by no more than the car drives in this time."""
+    ghosts_m = [ghost_m for ghost_m in ghosts_after_setting_the_clock(step_ns, 100) if ghost_m is not None]
+    assert len(ghosts_m) >= 99  # the delay is unknown until the next state if the clock goes back
+    for ghost_m in ghosts_m:
+        assert ghost_m == pytest.approx(LOOP_M, abs=8.0 * CLOCK_STEP_NS / NS_PER_S + LOOP_TOLERANCE_M)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from lavt.control.prediction import Motion, SteeringCommand
+from lavt.control.prediction import MAX_LOOP_NS, Motion, SteeringCommand
 from lavt.domain import NS_PER_MS, NS_PER_S, State
 
 MAX_STATES: Final = 256
@@ -19,6 +19,9 @@ STATE_AGE_NS: Final = 300 * NS_PER_MS
 """Nothing is predicted from an older state."""
 STATE_GAP_NS: Final = 100 * NS_PER_MS
 """Two states that are further apart do not tell when a command between them was applied."""
+CLOCK_STEP_NS: Final = 30 * NS_PER_MS
+"""If the vehicle's wall clock gains or loses more than this against its monotonic clock between two states, it was set.
+Less can be the age of the reported state, which differs from state to state."""
 DELAY_WINDOW_NS: Final = NS_PER_S // 2
 """The delay of the commands is measured from the states of this time."""
 
@@ -55,6 +58,11 @@ class EffectDelay:
         if 0 < state.sent_wall_ns - before.sent_wall_ns <= STATE_GAP_NS:
             self._bounds.append((now_ns, before.sent_wall_ns - sent_ns, state.sent_wall_ns - sent_ns))
 
+    def forget_clock(self) -> None:
+        """Forget what was measured with the vehicle's clock, because it was set."""
+        self._newest = None
+        self._bounds.clear()
+
     def at_ns(self, now_ns: int) -> int | None:
         """Return the delay; None: the vehicle has reported no newly applied command lately."""
         while self._bounds and self._bounds[0][0] < now_ns - DELAY_WINDOW_NS:
@@ -74,6 +82,9 @@ class LoopHistory:
         """When the newest state arrived."""
         self._commands: deque[tuple[int, float]] = deque(maxlen=MAX_COMMANDS)
         """Send times and steering angles of commands."""
+        self._set_at: tuple[int, int] | None = None
+        """When this client has seen that the vehicle's clock was set, and the time after which only the clock as it is
+        now can stamp a picture."""
 
     def note_command(self, sequence: int, steering_rad: float, now_ns: int) -> None:
         """Note a command that is sent now."""
@@ -84,6 +95,8 @@ class LoopHistory:
         """Note a newer state of a vehicle that this client has control of."""
         if self._states and self._states[-1].instance != state.instance:
             self.forget()
+        if self._states:
+            self._check_clock(self._states[-1], state, now_ns)
         self.delay.note_state(state, now_ns)
         self._states.append(state)
         self._state_ns = now_ns
@@ -93,6 +106,28 @@ class LoopHistory:
         self.delay = EffectDelay()
         self._states.clear()
         self._commands.clear()
+        self._set_at = None
+
+    def _check_clock(self, before: State, state: State, now_ns: int) -> None:
+        """Forget the times of the vehicle's wall clock if it was set between two states."""
+        expected_ns = before.sent_wall_ns + state.state_mono_ns - before.state_mono_ns
+        if abs(state.sent_wall_ns - expected_ns) <= CLOCK_STEP_NS:
+            return
+        self.delay.forget_clock()
+        self._states.clear()
+        self._set_at = now_ns, max(expected_ns, state.sent_wall_ns)
+
+    def is_comparable(self, picture_ns: int, now_ns: int) -> bool:
+        """Return whether a picture's stamp is of the same clock as the states, which it is unless the clock was set.
+
+        After that, pictures with stamps of the clock as it was may still be on the way, for `MAX_LOOP_NS` at most.
+        """
+        if self._set_at is None:
+            return True
+        seen_ns, later_than_ns = self._set_at
+        if picture_ns > later_than_ns or now_ns - seen_ns > MAX_LOOP_NS:
+            self._set_at = None
+        return self._set_at is None
 
     def current_state(self, now_ns: int) -> State | None:
         """Return the newest state; None: there is none, or it arrived `STATE_AGE_NS` ago or earlier."""

@@ -54,9 +54,12 @@ class PagePredictor:
     def predict_since(self, picture_ns: int, now_ns: int) -> Prediction | None:
         """Predict from the picture with this stamp to the effect of a command that is sent now.
 
-        None: the vehicle does not drive, the newest state is older than `STATE_AGE_NS`, or the loop delay is unknown.
+        None: the vehicle does not drive, the newest state is older than `STATE_AGE_NS`, the loop delay is unknown, or
+        the vehicle's clock was set since the picture.
         """
         history = self.history
+        if not history.is_comparable(picture_ns, now_ns):
+            return None
         delay_ns, state = history.delay.at_ns(now_ns), history.current_state(now_ns)
         if delay_ns is None or state is None or state.safety != "driving":
             return None
