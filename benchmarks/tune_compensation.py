@@ -18,6 +18,7 @@ from lavt.control.compensation import VARIANTS, Schedule
 from lavt.experiment.boundary.compensation_margin import (
     Predictor,
     compensated_phase_margin_rad,
+    compensated_spectral_radius,
     scheduled_loop,
     variant_critical_delay_s,
 )
@@ -77,6 +78,50 @@ def highest_speed_mps(total_delay_s: float) -> float:
     return 30 / 3.6 - smallest(0.0, 7.5, is_enough)
 
 
+ERRORS: dict[str, tuple[tuple[float, ...], Callable[[Predictor, float], Predictor]]] = {
+    "delay (ms)": (
+        tuple(step * 10.0 for step in range(1, 61)),
+        lambda known, error: replace(known, delay_error_s=error / 1000),
+    ),
+    "wheelbase (%)": (
+        tuple(step * 5.0 for step in range(1, 41)),
+        lambda known, error: replace(known, wheelbase_m=known.wheelbase_m * (1 + error / 100)),
+    ),
+    "steering lag (%)": (
+        tuple(step * 25.0 for step in range(1, 17)),
+        lambda known, error: replace(known, steering_lag_s=known.steering_lag_s * (1 + error / 100)),
+    ),
+}
+"""What a controller that predicts can be wrong about: the sizes of the error, and how it changes what is assumed."""
+
+
+def tolerated(kind: str, condition: str, name: str, sign: int) -> float | None:
+    """Return the smallest error with which the loop is unstable; None: it is stable with all of them."""
+    total_s, unreported_s = delays_s(condition)
+    known = Predictor(uses_reports=VARIANTS[kind].uses_reports, unreported_s=unreported_s)
+    sizes, change = ERRORS[name]
+    for error in (sign * size for size in sizes if name == "delay (ms)" or sign * size > -100):
+        wrong = change(known, error)
+        if wrong.assumed_s(total_s) < 0.03:  # the assumed effect is before the newest state
+            return None
+        loop = LateralLoop(VARIANTS[kind].lookahead_s, controller_wheelbase_m=wrong.wheelbase_m)
+        if compensated_spectral_radius(loop, wrong, total_s) >= 1:
+            return error
+    return None
+
+
+def print_tolerated() -> None:
+    """Print the smallest errors with which the loops that predict are unstable, by the model."""
+    print("\nsmallest error of an assumption with which the loop is unstable (-: none of those tried)")
+    for kind in ("predictive", "smith"):
+        for name in ERRORS:
+            cells = []
+            for condition in ("L0", "L5", "H2", "H4"):
+                bounds = [tolerated(kind, condition, name, sign) for sign in (-1, 1)]
+                cells.append(f"{condition}: " + " / ".join("-" if b is None else f"{b:+.0f}" for b in bounds))
+            print(f"{kind}, {name}: " + ", ".join(cells))
+
+
 def main() -> None:
     """Print the settings, and what the model says about the controllers with the settings of the code."""
     exact, model = Predictor(), Predictor(uses_reports=False)
@@ -105,6 +150,7 @@ def main() -> None:
         margins = [math.degrees(margin_rad(kind, loop, predictor, condition)) for condition in SHOWN]
         critical_s = variant_critical_delay_s(variant, loop, predictor)
         print(kind.ljust(20), *(f"{margin:4.0f}" for margin in margins), f"{1000 * critical_s:.0f} ms")
+    print_tolerated()
 
 
 if __name__ == "__main__":
