@@ -39,6 +39,8 @@ SCHEMAS: dict[str, type[Section]] = {
     "study.yaml": StudyConfig,
     "client.yaml": ClientConfig,
     "client-secure.yaml": ClientConfig,
+    "compensation.yaml": SweepConfig,
+    "compensation_mismatch.yaml": SweepConfig,
     "costs.yaml": Costs,
     "demo.yaml": RunConfig,
     "loss_and_jitter.yaml": SweepConfig,
@@ -96,10 +98,18 @@ def test_the_paper_config() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "count"), [("loss_and_jitter.yaml", 36), ("roads.yaml", 180), ("speed.yaml", 72), ("weather.yaml", 18)]
+    ("name", "count"),
+    [
+        ("compensation.yaml", 1080),
+        ("compensation_mismatch.yaml", 252),
+        ("loss_and_jitter.yaml", 36),
+        ("roads.yaml", 180),
+        ("speed.yaml", 72),
+        ("weather.yaml", 18),
+    ],
 )
 def test_sweeps_over_further_axes(name: str, count: int) -> None:
-    """The sweeps over loss and jitter, speed and weather can be planned; each axis contains the base config's value."""
+    """The sweeps over further axes can be planned; each axis contains the base config's value."""
     sweep = load_config(SweepConfig, shipped("configs") / name)
     runs = plan_sweep(sweep)
     assert len(runs) == count
