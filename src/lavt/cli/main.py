@@ -54,6 +54,7 @@ GROUPS = {
     },
     "Vehicle, camera and road": {
         "road": "Draw roads; import and export OpenDRIVE maps.",
+        "camera": "Calibrate a camera (docs/camera.md).",
         "perception": "Inspect lane detection.",
         "software-car": "Simulate a car with a by-wire kit on a CAN bus.",
         "can": "Inspect drive-by-wire CAN buses (docs/can.md).",
@@ -66,7 +67,19 @@ module of a command has its name, with `_` for `-`."""
 COMMANDS = {command: summary for group in GROUPS.values() for command, summary in group.items()}
 """All commands."""
 
-ON_ANY_SYSTEM = {"demo", "run", "replay", "sweep", "boundary", "study", "report", "join", "road", "perception"}
+ON_ANY_SYSTEM = {
+    "demo",
+    "run",
+    "replay",
+    "sweep",
+    "boundary",
+    "study",
+    "report",
+    "join",
+    "road",
+    "perception",
+    "camera",
+}
 """The commands that do something without real time, and so on other systems than Linux."""
 
 
