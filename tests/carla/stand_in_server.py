@@ -138,11 +138,21 @@ class StandInServer:
                     pose = wire.WirePose((float(x_m), -float(y_m), 0.0))
                     world.spawn([0, wire.VEHICLE, [["role_name", wire.STRING, "parked"]]], pose)
                     return "parked"
+                case ["keep", kind]:
+                    world.kept_kind = kind
+                    return "kept"
+                case ["destroy", kind]:
+                    number = next(actor.number for actor in world.actors.values() if actor.kind == kind)
+                    return str(world.destroy(number))
                 case ["tick_times"]:
                     return " ".join(map(str, self._tick_times_ns))
                 case ["pace", factor]:
                     self._pace = float(factor)
                     return "set"
+                case ["control", kind]:
+                    actor = next(actor for actor in world.actors.values() if actor.kind == kind)
+                    throttle, _, brake, hand_brake, *_ = actor.control
+                    return f"{throttle} {brake} {hand_brake}"
                 case ["frame"]:
                     return str(world.frame)
                 case ["speed"]:

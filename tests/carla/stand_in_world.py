@@ -108,6 +108,8 @@ class StandInWorld:
         self.late_pictures = 0
         """How many of the first ticks of a camera have no picture."""
         self._withheld: dict[int, int] = {}
+        self.kept_kind = ""
+        """Actors of this kind cannot be removed."""
 
     @property
     def is_synchronous(self) -> bool:
@@ -166,7 +168,9 @@ class StandInWorld:
         return actor.packed(self._stream_port)
 
     def destroy(self, number: int) -> bool:
-        """Remove an actor; return whether it existed."""
+        """Remove an actor; return whether it existed and is not of the kind that is kept."""
+        if number in self.actors and self.actors[number].kind == self.kept_kind:
+            return False
         self._cars.pop(number, None)
         self._renderers.pop(number, None)
         return self.actors.pop(number, None) is not None

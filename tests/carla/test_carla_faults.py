@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -15,8 +16,9 @@ import pytest
 from tests.carla.contract_vehicle import blind_settings, server_config
 from tests.carla.stand_in import REPOSITORY, StandIn, free_tcp_pair, need_carla, stand_in
 
-from lavt.assembly.vehicles import carla_settings
-from lavt.domain import Actuation
+from lavt.assembly.vehicles import build_carla, carla_settings
+from lavt.config import ServerCameraConfig
+from lavt.domain import NS_PER_S, Actuation, Now
 from lavt.errors import UserError, VehicleError
 from lavt.vehicle.carla import connection, library, session
 from lavt.vehicle.carla.session import BRAKED, CarlaSession
@@ -25,7 +27,8 @@ from lavt.vehicle.sim.road.road import load_road
 pytestmark = pytest.mark.full
 
 FULL_THROTTLE = Actuation(0.0, 1.0, 0.0)
-CAR_AND_SENSORS = "vehicle.lincoln.mkz_2020 sensor.other.collision sensor.other.lane_invasion"
+CAR = "vehicle.lincoln.mkz_2020"
+CAR_AND_SENSORS = f"{CAR} sensor.other.collision sensor.other.lane_invasion"
 TIMEOUT_S = 1.0
 KILLED_CLIENT = """
 import os, sys
@@ -105,9 +108,6 @@ def test_an_absent_server_is_named() -> None:
 
 def test_a_camera_of_another_source_is_refused() -> None:
     """A car in CARLA has CARLA's camera only."""
-    from lavt.assembly.vehicles import build_carla
-    from lavt.config import ServerCameraConfig
-
     config = server_config(2000).model_copy(update={"camera": ServerCameraConfig()})
     with pytest.raises(UserError, match=r"set camera\.source carla"):
         build_carla(config)
@@ -172,6 +172,63 @@ def test_the_leftovers_of_a_killed_run_are_removed(server: StandIn) -> None:
         assert server.ask("speed").split()[0] == "0.000"
     assert server.ask("actors") == ""
     assert server.ask("settings") == "False [False]"
+
+
+def test_a_leftover_that_the_server_keeps_is_named_and_stands_still() -> None:
+    """A killed run's car that the server does not remove ends the next run, in a frozen world, with the car braked."""
+    with stand_in() as server:
+        killed = subprocess.run(
+            [sys.executable, "-c", KILLED_CLIENT, str(server.port)],
+            cwd=REPOSITORY,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)])},
+            check=False,
+            stdout=subprocess.DEVNULL,
+        )
+        assert killed.returncode == -9
+        assert server.ask("keep", CAR) == "kept"
+        with pytest.raises(VehicleError, match=f"did not remove {CAR}, which a killed run left: restart it"):
+            CarlaSession(blind_settings(server.port, timeout_s=20.0)[0])
+        assert server.ask("actors") == CAR
+        assert server.ask("settings").startswith("True")
+        assert server.ask("control", CAR) == "0.0 1.0 True"
+
+
+def test_a_car_that_the_server_keeps_is_left_braked_in_a_frozen_world() -> None:
+    """If the server does not remove the car at the end, the world stays frozen and the car is braked."""
+    with stand_in() as server:
+        with driving(server.port):
+            assert server.ask("keep", CAR) == "kept"
+        assert server.ask("actors") == CAR
+        assert server.ask("settings").startswith("True")
+        assert server.ask("control", CAR) == "0.0 1.0 True"
+
+
+def test_a_sensor_that_another_client_destroyed_does_not_hinder_the_end(server: StandIn) -> None:
+    """Without its collision sensor the car drives on, and at the end everything else is removed and restored."""
+    with driving(server.port) as opened:
+        assert server.ask("destroy", "sensor.other.collision") == "True"
+        opened.tick(FULL_THROTTLE)
+    assert server.ask("actors") == ""
+    assert server.ask("settings") == "False [False]"
+
+
+def test_a_camera_that_another_client_destroyed_ends_the_run() -> None:
+    """Without its camera the car cannot be driven: the next picture fails with a sentence, not with a wait forever."""
+    with stand_in("--scenery", "none", "--camera", "320", "240") as server:
+        config = server_config(server.port, tick_timeout_s=TIMEOUT_S, timeout_s=20.0)
+        size = ServerCameraConfig(source="carla", width_px=320, height_px=240)
+        setup = build_carla(config.model_copy(update={"camera": size}))
+        assert setup.start is not None
+        with contextlib.ExitStack() as opened:
+            opened.callback(setup.close)
+            vehicle = setup.start(Now(0, 0))
+            vehicle.advance(NS_PER_S)
+            assert setup.camera.capture(1, NS_PER_S, None) is not None
+            assert server.ask("destroy", "sensor.camera.rgb") == "True"
+            vehicle.advance(2 * NS_PER_S)
+            with pytest.raises(VehicleError, match="the camera is gone"):
+                setup.camera.capture(2, 2 * NS_PER_S, None)
+        assert server.ask("actors") == ""
 
 
 def test_a_second_ticking_client_is_refused(server: StandIn) -> None:

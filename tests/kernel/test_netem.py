@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from statistics import fmean, median, quantiles
 from typing import Any, Literal
@@ -529,4 +529,35 @@ def test_interrupted_run_restores_the_loopback(tmp_path: Path) -> None:
 
     assert "4c02" in with_delay
     assert run.returncode == 1
+    assert command("tc -j qdisc show dev lo") == before
+
+
+def test_a_second_interrupt_of_a_sweep_restores_the_loopback(tmp_path: Path) -> None:
+    """The second Ctrl-C kills the run in progress, whose netem is then removed from lo by the sweep itself."""
+    before = command("tc -j qdisc show dev lo")
+    settings = ("time=real", "network.injection=netem", "conditions=[L4]", "routes=[a_key]", "repetitions=2")
+    arguments = [word for setting in settings for word in ("--set", setting)]
+    with subprocess.Popen(
+        [
+            *(sys.executable, "-B", "-m", "lavt", "sweep", str(shipped("configs/sweep.yaml")), "--jobs", "1"),
+            *("--out", str(tmp_path / "sweep"), *arguments),
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as sweep:
+        assert sweep.stderr is not None
+        for _ in range(900):
+            if "4c02" in command("tc -j qdisc show dev lo"):
+                break
+            pause(100 * NS_PER_MS)
+        os.killpg(sweep.pid, signal.SIGINT)
+        printed = list(takewhile(lambda line: "Ctrl-C again" not in line, sweep.stderr))
+        with_delay = command("tc -j qdisc show dev lo")
+        os.killpg(sweep.pid, signal.SIGINT)
+        _, rest = sweep.communicate(timeout=120)
+
+    assert "4c02" in with_delay, "".join(printed) + rest
+    assert sweep.returncode == 1
     assert command("tc -j qdisc show dev lo") == before

@@ -60,6 +60,7 @@ class CarlaCamera:
             return None
         picture = self._session.pictures.take(ticked.snapshot.frame, timeout_s)
         if picture is None:
+            self._session.check_camera()
             return None
         self._last_ns = ticked.due_ns
         return CapturedFrame(number, ticked.due_ns, picture)
@@ -67,6 +68,8 @@ class CarlaCamera:
     def _capture_newest(self, number: int, follower: Follower) -> CapturedFrame | None:
         """Return the newest picture of a world that runs by itself, waiting for a new one at most a period."""
         newest = self._session.pictures.take_newest(1 / self.rate_hz)
+        if newest is None:
+            self._session.check_camera()
         ticked = None if newest is None else follower.wait_for_frame(newest[0], 1 / self.rate_hz)
         if newest is None or ticked is None or ticked.due_ns <= self._last_ns:
             return None

@@ -170,6 +170,17 @@ class CarlaSession:
         with sentences(self.settings, "name its town"):
             return town_of(self._world)
 
+    def check_camera(self) -> None:
+        """Raise `VehicleError` if another client has destroyed the camera."""
+        camera = next((actor for actor in self._actors if actor.type_id == CAMERA), None)
+        with sentences(self.settings, "list its actors"):
+            is_there = camera is None or self._world.get_snapshot().has_actor(camera.id)
+        if not is_there:
+            raise VehicleError(
+                f"the camera is gone from the CARLA server at {self.settings.address}: end the other client that "
+                "destroyed it"
+            )
+
     def take_events(self) -> list[CarlaEvent]:
         """Return the collisions and lane invasions that arrived since the last call."""
         return [self._events.popleft() for _ in range(len(self._events))]
