@@ -103,8 +103,8 @@ def test_a_calibrated_camera_can_be_mounted_again(calibrate: Calibrate) -> None:
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        ((), "either pictures of a chessboard, or a calibration with --lens"),
-        (("boards", "--lens", "lens.yaml"), "either pictures of a chessboard, or a calibration with --lens"),
+        ((), "name either pictures of a chessboard, or a calibration with --lens"),
+        (("boards", "--lens", "lens.yaml"), "name either pictures of a chessboard, or a calibration with --lens"),
         (("boards", "--corners", "nine"), "'nine': write COLUMNSxROWS"),
         (("boards", "--corners", "7x7", *PLACE), "0 pictures show the whole board, but 3 are needed"),
         (("boards",), "give --x-m, and either --z-m or --road"),

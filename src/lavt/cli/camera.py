@@ -89,7 +89,7 @@ def calibrate(
     Example: lavt camera calibrate boards/ --x-m 1.6 --z-m 1.4 --out camera.yaml
     """
     if (lens is None) == (not boards):
-        raise UserError("name either pictures of a chessboard, or a calibration with --lens")
+        raise UserError("the lens has one source: name either pictures of a chessboard, or a calibration with --lens")
     if not out.parent.is_dir():
         raise UserError(f"{out.parent} is not a directory: create it, or name another file with --out")
     check = check or out.with_name(f"{out.stem}-check.png")
