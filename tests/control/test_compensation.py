@@ -17,7 +17,7 @@ from lavt.control.compensation import (
 )
 from lavt.control.drive_controller import DriveController, LaneKeeper, make_controller
 from lavt.control.preset import DESIGNED
-from lavt.control.pure_pursuit import pursuit_path_per_m
+from lavt.control.pure_pursuit import PlanarPose, pursuit_path_per_m
 from lavt.domain import NS_PER_MS, NS_PER_S, PATH_POINTS, Actuation, Decision, Lane, State
 from lavt.vehicle.sim.dynamics import LINCOLN_MKZ, CarDynamics, CarMotion
 
@@ -25,6 +25,7 @@ STEP_NS = 5 * NS_PER_MS
 FRAME_NS = 35 * NS_PER_MS
 STATE_NS = 20 * NS_PER_MS
 SPEED_MPS = 8.0
+CLOCK_SET_NS = 3 * NS_PER_S
 EXACT = CompensationSettings(camera_delay_s=0.0, average_lag_s=0.0)
 """The camera of this loop stamps a picture at its exposure, and nothing is averaged."""
 PRESET = replace(DESIGNED, speed_mps=SPEED_MPS)
@@ -38,6 +39,8 @@ class Loop:
     video_ms: int = 500
     control_ms: int = 100
     vehicle_clock_ns: int = 1_700_000_000 * NS_PER_S
+    clock_step_ns: int = 0
+    """By how much the vehicle's wall clock is set after `CLOCK_SET_NS`."""
 
     def drive(self, seconds: float, *, offset_m: float = 0.5) -> list[float]:
         """Return the lateral errors at each picture, and store the decisions."""
@@ -48,6 +51,7 @@ class Loop:
         self.decisions: list[Decision] = []
         for now_ns in range(0, round(seconds * NS_PER_S), STEP_NS):
             motion, wall_ns = car.motion, now_ns + self.vehicle_clock_ns
+            wall_ns += self.clock_step_ns * (now_ns >= CLOCK_SET_NS)
             if now_ns % FRAME_NS == 0:
                 slope = -math.tan(motion.heading_rad)
                 lane = Lane((-motion.y_m / math.cos(motion.heading_rad), slope, 0.0), 3.5, 2.0, 20.0, 1.0)
@@ -57,7 +61,7 @@ class Loop:
                 _, applied, target_rad = commands.popleft()
             history = getattr(self.controller, "history", None)
             if now_ns % STATE_NS == 0 and history is not None:
-                history.note_state(state(wall_ns, motion, applied), now_ns)
+                history.note_state(state(wall_ns, now_ns, motion, applied), now_ns)
             while pictures and pictures[0][0] <= now_ns:
                 _, stamp_ns, lane, speed_mps = pictures.popleft()
                 if isinstance(self.controller, CompensatingController):
@@ -72,11 +76,11 @@ class Loop:
         return errors
 
 
-def state(wall_ns: int, motion: CarMotion, applied: int) -> State:
+def state(wall_ns: int, mono_ns: int, motion: CarMotion, applied: int) -> State:
     """Return the state that the car reports."""
     return State(
         sent_wall_ns=wall_ns,
-        state_mono_ns=wall_ns,
+        state_mono_ns=mono_ns,
         speed_mps=motion.speed_mps,
         steering_rad=motion.steering_rad,
         gear="drive",
@@ -92,6 +96,30 @@ def controller(kind: str, settings: CompensationSettings = EXACT) -> Compensatin
     variant = VARIANTS[kind]
     preset = replace(PRESET, lookahead_s=variant.lookahead_s)
     return CompensatingController(variant, preset, wheelbase_m=LINCOLN_MKZ.wheelbase_m, settings=settings)
+
+
+@pytest.mark.parametrize("step_s", [-2.0, -0.2, 0.2, 2.0])
+def test_no_pose_is_predicted_with_two_clocks(step_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """When the vehicle's clock is set, nothing is predicted until pictures with stamps of the new clock arrive."""
+    known = controller("predictive")
+    predict, predicted = known._predict_pose, []
+
+    def spy(speed_mps: float, now_ns: int) -> PlanarPose | None:
+        pose = predict(speed_mps, now_ns)
+        predicted.append((now_ns / NS_PER_S, pose))
+        return pose
+
+    monkeypatch.setattr(known, "_predict_pose", spy)
+    Loop(known, clock_step_ns=round(step_s * NS_PER_S)).drive(9)
+    set_s, total_delay_s = CLOCK_SET_NS / NS_PER_S, 0.6
+    without = [at_s for at_s, pose in predicted if pose is None and at_s > set_s]
+    poses = [(at_s, pose) for at_s, pose in predicted if pose is not None]
+
+    assert len(without) > 10
+    assert max(without) < set_s + 0.7 + max(0.0, -step_s)
+    assert poses[-1][0] > 8.9
+    for at_s, (x_m, _, _) in poses:
+        assert x_m == pytest.approx(SPEED_MPS * total_delay_s, rel=0.1), at_s
 
 
 @pytest.mark.parametrize(

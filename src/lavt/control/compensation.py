@@ -107,8 +107,9 @@ class CompensationSettings:
 class CompensatingController:
     """A lane keeper that knows the delay of its loop, and does what its variant says.
 
-    `history` gets the vehicle's states and the commands sent. Until the delay is known it drives as the lane keeper
-    does. Without a lane it follows the last lane and uses no pedal.
+    `history` gets the vehicle's states and the commands sent. Until the delay is known, and while pictures from before
+    a step of the vehicle's clock arrive, it drives as the lane keeper does. Without a lane it follows the last lane and
+    uses no pedal.
     """
 
     def __init__(
@@ -145,7 +146,10 @@ class CompensatingController:
         if self._remembered.update(lane, speed_mps * step_s, self._curvature_per_m) and self._stamp_ns is not None:
             exposed_ns = self._stamp_ns - round(self._settings.camera_delay_s * NS_PER_S)
             self._lane_ns = exposed_ns - round(self._settings.average_lag_s * NS_PER_S)
-            self._measure_delay(exposed_ns, now_ns)
+            if self.history.is_comparable(self._stamp_ns, now_ns):
+                self._measure_delay(exposed_ns, now_ns)
+            else:  # the vehicle's clock was set since the picture
+                self._delay_ns = None
         followed, pose = self._remembered.lane, self._remembered.pose
         if self._variant.predicts:
             pose = self._predict_pose(speed_mps, now_ns) or pose
