@@ -1,11 +1,13 @@
-"""The prediction of the car's pose for a person who sees delayed pictures: where the car will be, and can stop.
+"""The prediction of the car's pose from delayed pictures: where the car will be, and where it can stop.
+
+A person's page shows it, and the controllers of `lavt.control.compensation` steer from it.
 
 The model is the kinematic single-track model at the rear axle, without slip (R. Rajamani, *Vehicle Dynamics and
 Control*, 2nd ed., 2012, section 2.2): curvature tan(steering) / wheelbase. The speed stays as last reported, because a
 client does not know how strongly the vehicle's pedals act. The wheels follow the commanded angle with a first-order lag
 and at a limited rate.
 
-All times are on the vehicle's clock. Nothing here reads a clock, and nothing here changes a command.
+All times are on the vehicle's clock. Nothing here reads a clock.
 """
 
 from __future__ import annotations
