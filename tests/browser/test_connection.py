@@ -67,10 +67,12 @@ def test_no_input_waits_behind_others(page: ConnectedPage) -> None:
     assert len(page.client.inputs) == sent
     assert "no status from lavt for" in page.text("hint")
     assert page.text("safety") == "no state"
+    assert page.tab.evaluate("document.body.classList.contains('old')")
     page.stop()
     wait_until("the stop is sent", lambda: page.client.stops > 0)
     page.client.is_silent = False
     wait_until("inputs are sent again", lambda: len(page.client.inputs) > sent)
+    assert not page.tab.evaluate("document.body.classList.contains('old')")
 
 
 def test_no_input_is_sent_behind_unsent_bytes(page: ConnectedPage) -> None:

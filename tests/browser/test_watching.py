@@ -120,7 +120,7 @@ def test_a_page_watches_the_lane_keeper(browser: Browser, watched_drive: Watched
             "lane_keeper",
             False,
         )
-        assert (shown(tab, "connection"), shown(tab, "safety")) == ("watches lane_keeper", "driving")
+        assert (shown(tab, "connection"), shown(tab, "safety")) == ("this page watches lane_keeper", "driving")
         assert all(is_hidden(tab, element) for element in ("stop", "take", "release", "calibrate", "network"))
         wait_until(
             "latencies are shown", lambda: all("ms" in shown(tab, f"{name}_ms") for name in ("age", "round_trip"))

@@ -25,11 +25,11 @@ from lavt.nodes.payloads import (
     DelayChoice,
     FrameStamp,
     HumanSample,
-    PagePicture,
     ReceivedUnit,
     RelayDelay,
 )
 from lavt.nodes.picture_reader import PictureReader
+from lavt.nodes.shown_frames import ShownFrames
 from lavt.transport.console.page_messages import (
     PageAck,
     PageDelay,
@@ -47,11 +47,8 @@ from lavt.transport.console.page_messages import (
     parse_page_message,
 )
 from lavt.transport.rtp.reception_stats import ReceptionSample
-from lavt.transport.video.stamp import rtp_timestamp
 
 STATUS_PERIOD_NS: Final = 50 * NS_PER_MS
-MAX_FRAMES: Final = 300
-"""How many frames are remembered until the page has shown them: ten seconds at 30 Hz."""
 STATE_AGE_NS: Final = 300 * NS_PER_MS
 """An older state does not tell what the vehicle does now."""
 SEAT_NS: Final = 5 * NS_PER_S
@@ -95,12 +92,9 @@ class HumanDriverNode(Commander):
         self._status_ns = 0
         self._hand: str = "no_page"
         """The state of the hand in the last record entry."""
-        self._frames: dict[int, FrameStamp] = {}
-        """Decoded frames by RTP timestamp."""
+        self._shown = ShownFrames()
         self._bit_rate, self._round_trip = BitRate(), RoundTrip()
         self._reception: ReceptionSample | None = None
-        self._shown_unit: int | None = None
-        """The newest access unit that the driving page has shown, if it has not been decoded here yet."""
         self._last: tuple[int, Decision] | None = None
         """Time and content of the last command."""
         self.pipelines: Mapping[str, Sequence[Stage]] = {
@@ -119,7 +113,7 @@ class HumanDriverNode(Commander):
     def counts(self) -> Mapping[str, int]:
         """Return the counts of the node, its picture reader, the controls and the pages."""
         pages = sum((page.counts for page in self._pages.values()), self._page_counts)
-        return {**self._reader.counts, **self._controls.counts, **pages, **self._counts}
+        return {**self._reader.counts, **self._controls.counts, **pages, **self._shown.counts, **self._counts}
 
     def next_wake_ns(self) -> int | None:
         """Return when a command, a session request or a status is due."""
@@ -156,14 +150,9 @@ class HumanDriverNode(Commander):
 
     def _note_view(self, message: Message, now: Now) -> None:
         frame: DecodedFrame = message.payload
-        unit = rtp_timestamp(frame.stamp_ns)  # `PictureReader` has checked that they agree
-        if len(self._frames) >= MAX_FRAMES:
-            self._frames.pop(next(iter(self._frames)))
-        self._frames[unit] = FrameStamp(frame.stamp_ns, frame.read_wall_ns)
         if self._predictor is not None:
             self._predictor.note_picture(frame.stamp_ns)
-        if unit == self._shown_unit:
-            self._show(unit, now)
+        self._decide_from(self._shown.note_decoded(frame), now)
 
     def _note_reception(self, message: Message, _now: Now) -> None:
         self._reception = message.payload
@@ -171,30 +160,18 @@ class HumanDriverNode(Commander):
     def _acknowledge(self, page: Peer, ack: PageAck, now: Now) -> list[Send]:
         is_known = self._pages[page].acknowledge(ack.unit)
         if is_known and page == self._driving_page:
-            self._show(ack.unit, now)
+            self._decide_from(self._shown.show(ack.unit), now)
         return self._request_keyframe(page)
 
-    def _show(self, unit: int, now: Now) -> None:
-        """Decide from a frame that the page has shown, or as soon as this client has decoded it, too."""
-        frame = self._frames.get(unit)
-        self._shown_unit = unit if frame is None else None
+    def _decide_from(self, frame: FrameStamp | None, now: Now) -> None:
+        """Decide from a frame that the page has shown, and that this client has decoded, too; None: there is none."""
         if frame is not None:
             self._view, self._view_ns = frame, now.mono_ns
 
     def _record_shown(self, page: Peer, shown: PageShown, _now: Now) -> list[Send]:
         """Record when the driving page had a picture, unless the page has read another stamp than this client."""
-        frame = self._frames.get(shown.unit)
-        if page != self._driving_page or frame is None:
-            return []
-        is_true = int(shown.stamp) == frame.stamp_ns
-        self._counts["page_stamps_true" if is_true else "page_stamps_false"] += 1
-        if not is_true:
-            return []
-        page_times_us = (shown.arrived_us, shown.decoded_us, shown.drawn_us, shown.shown_us)
-        offset_ns = round(shown.offset_us * NS_PER_US)
-        arrived_ns, decoded_ns, drawn_ns, shown_ns = (time_us * NS_PER_US + offset_ns for time_us in page_times_us)
-        bound_ns = round(shown.bound_us * NS_PER_US)
-        return [Send("page_picture", PagePicture(frame.stamp_ns, arrived_ns, decoded_ns, drawn_ns, shown_ns, bound_ns))]
+        picture = self._shown.times(shown) if page == self._driving_page else None
+        return [] if picture is None else [Send("page_picture", picture)]
 
     def _lose_video(self, page: Peer, _lost: PageLost, _now: Now) -> list[Send]:
         self._pages[page].lose()
@@ -238,7 +215,7 @@ class HumanDriverNode(Commander):
 
     def _forget_view(self) -> None:
         """Make no command from a picture of another page; after an emergency stop, commands still carry it."""
-        self._shown_unit = None
+        self._shown.forget_awaited()
         if not self.session.emergency_stop:
             self._view = None
 

@@ -29,6 +29,12 @@ export function showClosed(text, stop = "") {
   const warnings = { "": text, pending: `${STOP_NOT_SENT} ${STOP_SENT_LATER}`, lost: `${STOP_NOT_SENT} ${text}` };
   byId("hint").textContent = warnings[stop];
   byId("take").hidden = byId("release").hidden = true;
+  markOld(true);
+}
+
+// Dim the figures while they are old.
+function markOld(isOld) {
+  document.body.classList.toggle("old", isOld);
 }
 
 // Show nothing old as the present state if lavt has sent nothing for a while.
@@ -36,6 +42,7 @@ export function showSilence(silence_ms, isStopPending) {
   if (silence_ms < STALE_MS) return;
   const silence = `no status from lavt for ${Math.floor(silence_ms / 1000)} s`;
   byId("connection").textContent = silence;
+  markOld(true);
   showSafety("");
   byId("reason").textContent = "";
   byId("hint").textContent = isStopPending
@@ -52,7 +59,9 @@ function showSafety(name) {
 export function showStatus(status, input, video, age_ms, isStopPending, notice) {
   const isWatching = status.controller !== "";
   document.body.classList.toggle("watching", isWatching);
-  byId("connection").textContent = status.role === "drives" ? "drives" : isWatching ? `watches ${status.controller}` : "watches";
+  markOld(false);
+  const watched = isWatching ? ` ${status.controller}` : "";
+  byId("connection").textContent = status.role === "drives" ? "this page drives" : `this page watches${watched}`;
   showSafety(status.safety);
   const rejected = status.rejected && `command rejected: ${status.rejected}`;
   const limited = status.limited && `limited: ${status.limited}`;
@@ -96,10 +105,10 @@ function hint(status, input, isStopPending, notice) {
   if (status.controller !== "") return watchHint(status);
   if (isStopPending || status.emergency_stop === "sent") return STOP_NOT_CONFIRMED;
   if (isPast(status)) {
-    return "an earlier emergency stop was confirmed, but the vehicle is in another state now; restart this client to drive";
+    return "an earlier emergency stop was confirmed, but the vehicle is in another state now. To drive again, end lavt with Ctrl-C and start it again";
   }
-  if (status.emergency_stop === "confirmed") return "emergency stop: the vehicle has confirmed it; restart this client to drive";
-  if (status.role === "watches") return status.can_drive ? "no page drives" : "another page drives";
+  if (status.emergency_stop === "confirmed") return "emergency stop: the vehicle has confirmed it. To drive again, end lavt with Ctrl-C and start it again";
+  if (status.role === "watches") return status.can_drive ? "no page drives: press the button to drive from this one" : "another page drives; this one can only watch, and stop";
   if (status.phase === "seeking" || status.phase === "stopped" || status.phase === "watching") {
     return status.session_reason || "waiting for the vehicle";
   }
