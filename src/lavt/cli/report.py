@@ -29,7 +29,8 @@ def report(
 ) -> None:
     """Write a report of finished runs.
 
-    The command computes the results from the records again, and writes summary.json and report/index.html.
+    The command computes the results from the records again, and writes summary.json and report/index.html. Of several
+    sweeps, it also prints completed runs and cross-track errors side by side, by route and condition.
 
     Example: lavt report out/paper out/designed --out out/both
     """
@@ -37,6 +38,7 @@ def report(
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is not a directory: name another with --out")
     from lavt.experiment.report.report import read_failed, write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.report.side_by_side import side_by_side  # noqa: PLC0415 (the same)
 
     boundaries = [_read_boundary(directory) for directory in directories if (directory / BOUNDARY).is_file()]
     found_runs = {directory: _find_runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
@@ -44,8 +46,9 @@ def report(
         raise UserError(f"{directories[0]} has a boundary but no runs: name the directory of a sweep, too")
     runs = [run for runs_in_directory in found_runs.values() for run in runs_in_directory]
     results = [read_result(run / RESULT) for run in runs]  # all are read before any is written
-    for run, result in zip(runs, results, strict=True):
-        compute_result(run, result, result.get("digest"))
+    computed = {
+        run: compute_result(run, result, result.get("digest")) for run, result in zip(runs, results, strict=True)
+    }
     names = _sweep_names(list(found_runs))
     sweeps = {run: name for directory, name in names.items() for run in found_runs[directory]}
     make_directory(out)
@@ -56,6 +59,9 @@ def report(
         page = write_report(
             out, run_dirs=runs, base=base, sweeps=sweeps, boundaries=boundaries, failed=failed, answers=answers
         )
+    if names:
+        for line in side_by_side({name: [computed[run] for run in found_runs[at]] for at, name in names.items()}):
+            console.print_result(line)
     console.print_result(f"the report is {page}")
 
 

@@ -190,7 +190,8 @@ class SweepConfig(RunConfig):
     """Many runs: every route under every condition, repeated, for every combination of further axes."""
 
     routes: tuple[str, ...] = ("a_key",)
-    """The routes that are driven; they replace `vehicle.route`."""
+    """The routes that are driven; they replace `vehicle.route`. Paths of road files, such as imported ones
+    (`docs/opendrive.md`), may stand beside names."""
     conditions: tuple[str, ...] = ("L0", "L1", "L2", "L3", "L4", "L5")
     """The network conditions that are driven."""
     repetitions: int = Field(1, ge=1, le=10_000)
