@@ -535,7 +535,8 @@ def test_interrupted_run_restores_the_loopback(tmp_path: Path) -> None:
 def test_a_second_interrupt_of_a_sweep_restores_the_loopback(tmp_path: Path) -> None:
     """The second Ctrl-C kills the run in progress, whose netem is then removed from lo by the sweep itself."""
     before = command("tc -j qdisc show dev lo")
-    settings = ("time=real", "network.injection=netem", "conditions=[L4]", "routes=[a_key]", "repetitions=2")
+    settings = ["time=real", "network.injection=netem", "network.inherent=loopback", "repetitions=2"]
+    settings += ["conditions=[L4]", "routes=[a_key]"]
     arguments = [word for setting in settings for word in ("--set", setting)]
     with subprocess.Popen(
         [
