@@ -106,7 +106,7 @@ def test_a_calibrated_camera_can_be_mounted_again(calibrate: Calibrate) -> None:
         ((), "name either pictures of a chessboard, or a calibration with --lens"),
         (("boards", "--lens", "lens.yaml"), "name either pictures of a chessboard, or a calibration with --lens"),
         (("boards", "--corners", "nine"), "'nine': write COLUMNSxROWS"),
-        (("boards", "--corners", "7x7", *PLACE), "0 pictures show the whole board, but 3 are needed"),
+        (("boards", "--corners", "7x7", *PLACE), "0 pictures show the whole board, 0 of them different, but 3"),
         (("boards",), "give --x-m, and either --z-m or --road"),
         (("nowhere", *PLACE), "nowhere does not exist"),
         (("--lens", "lens.yaml", "--out", "nowhere/camera.yaml"), "nowhere is not a directory"),

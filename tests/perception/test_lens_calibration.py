@@ -47,8 +47,36 @@ def test_a_hidden_corner_is_no_board() -> None:
 def test_two_boards_are_too_few() -> None:
     """Fewer than three boards are rejected with what is needed."""
     board = np.zeros((54, 1, 2), dtype=np.float32)
-    with pytest.raises(UserError, match="2 pictures show the whole board, but 3 are needed"):
+    with pytest.raises(UserError, match="2 pictures show the whole board, 1 of them different, but 3"):
         calibrate_lens([board] * 2, CORNERS, SIZE_PX)
+
+
+def test_copies_of_one_board_are_too_few() -> None:
+    """Ten copies of a board, and copies that are shifted by some pixels, are one view."""
+    board = boards_of(PINHOLE)[0]
+    copies = [board + np.float32(0.4 * number) for number in range(10)]
+    with pytest.raises(UserError, match="10 pictures show the whole board, 1 of them different"):
+        calibrate_lens(copies, CORNERS, SIZE_PX)
+
+
+def test_boards_that_all_face_the_camera_determine_no_lens() -> None:
+    """Without a tilted board, any focal length explains the pictures, so none is accepted."""
+    rays = rays_of_pixels(PINHOLE)
+    poses = [
+        (across, down, ahead, 0.0, 0.0) for across, down, ahead in ((0, 0, 11), (-2, 1, 14), (2, -1, 14), (1, 1, 18))
+    ]
+    boards = [board for pose in poses if (board := find_corners(render_board(rays, pose), CORNERS)) is not None]
+    assert len(boards) == len(poses)
+    with pytest.raises(UserError, match=r"do not determine the lens, because .* tilted by up to 45 degrees"):
+        calibrate_lens(boards, CORNERS, SIZE_PX)
+
+
+def test_a_lens_that_cannot_be_is_refused() -> None:
+    """Corners at random, which no lens explains, are refused, and no lens is returned."""
+    generator = np.random.default_rng(3)
+    boards = [generator.uniform(50, 430, (54, 1, 2)).astype(np.float32) for _ in range(6)]
+    with pytest.raises(UserError, match=r"do not determine the lens|cannot calibrate the lens"):
+        calibrate_lens(boards, CORNERS, SIZE_PX)
 
 
 def test_the_covered_shares_are_those_between_the_outermost_corners() -> None:

@@ -49,6 +49,26 @@ def test_the_mounting_is_found_from_two_lines(camera: CalibratedCamera, roll_deg
     assert (found.x_m, found.y_m, found.focal_px) == (true.x_m, true.y_m, true.focal_px)
 
 
+@pytest.mark.parametrize(
+    ("left_px", "reason"),
+    [
+        ([(100.0, 400.0), (100.0, 400.0)], "--left are too close together"),
+        ([(100.0, 400.0), (103.0, 395.0)], "--left are too close together"),
+    ],
+)
+def test_points_that_are_close_together_are_refused(left_px: list[tuple[float, float]], reason: str) -> None:
+    """A repeated point, or two that are nearly the same, do not give the direction of a line."""
+    with pytest.raises(UserError, match=reason):
+        find_mounting(unmounted(SIMULATED), np.array(left_px), pixels_of_line(SIMULATED, -1.5), 3.5)
+
+
+def test_a_line_that_is_seen_over_two_metres_only_is_refused() -> None:
+    """Points that are far apart in the picture but not along the road are refused with their distance."""
+    near = np.array([(4.0, 2.0), (5.5, 2.0)])
+    with pytest.raises(UserError, match=r"--left are 1\.\d m apart along the road, but at least 4 m"):
+        find_mounting(unmounted(SIMULATED), picture_points(SIMULATED, near), pixels_of_line(SIMULATED, -1.5), 3.5)
+
+
 def test_the_mounting_of_the_simulated_camera_is_found_in_its_picture() -> None:
     """From the brightest pixels of the lines in a rendered picture, the pose of the camera is found."""
     picture = Scene(MODEL).render(LANE)

@@ -109,7 +109,10 @@ def test_another_output_is_rejected(tmp_path: Path, output: dict[str, Any], reas
 
 @pytest.mark.parametrize(
     ("content", "reason"),
-    [(b"not a network" * 20, "OpenCV cannot read .*bright.onnx"), (None, "there is no file .*bright.onnx")],
+    [
+        (b"not a network" * 20, "OpenCV cannot read .*bright.onnx"),
+        (None, ".*bright.onnx is not a file: correct the key model"),
+    ],
 )
 def test_an_unreadable_network_is_rejected(tmp_path: Path, content: bytes | None, reason: str) -> None:
     """A missing file, and a file that is not ONNX, are user errors."""

@@ -6,6 +6,7 @@ and Machine Intelligence 22, 2000, pp. 1330-1334.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,7 +21,18 @@ Corners = NDArray[np.float32]
 """The inner corners of a chessboard in a picture, row by row, (n, 1, 2) in pixels."""
 
 MIN_BOARDS = 3
-"""Fewer pictures of the board do not determine a lens."""
+"""Fewer different pictures of the board do not determine a lens."""
+SAME_BOARD_SHARE = 0.01
+"""Two boards whose corners are closer together than this share of the picture's width, on average, are the same."""
+MAX_RMS_SHARE = 0.005
+"""A calibration that misses the corners by more than this share of the picture's width is none."""
+MIDDLE_SHARES = (0.2, 0.8)
+"""Where the middle of a real lens can be, as a share of the picture."""
+MAX_FOCAL_RATIO = 1.25
+MIN_FIELD_RAD = math.radians(5)
+MAX_FOCAL_DEVIATION = 0.05
+"""The largest relative standard deviation of the focal length."""
+MORE_BOARDS = "take more, tilted by up to 45 degrees to each side, near and far, and in all corners of the picture"
 REFINE_WINDOW_PX = 11
 """Half the largest side of the window in which a corner is refined; a window must not reach the next corner."""
 FISHEYE_FLAGS = ("CALIB_RECOMPUTE_EXTRINSIC", "CALIB_FIX_SKEW")
@@ -69,10 +81,11 @@ def calibrate_lens(
 
     Raises `UserError` if there are too few boards, or if they do not determine the lens.
     """
-    if len(boards) < MIN_BOARDS:
+    different = different_boards(boards, picture_px[0])
+    if different < MIN_BOARDS:
         raise UserError(
-            f"{len(boards)} pictures show the whole board, but {MIN_BOARDS} are needed and 10 to 20 are good: take "
-            "more, from different directions and in all corners of the picture, or correct --corners"
+            f"{len(boards)} pictures show the whole board, {different} of them different, but {MIN_BOARDS} different "
+            f"ones are needed and 10 to 20 are good: {MORE_BOARDS}, or correct --corners"
         )
     columns, rows = size
     board = np.zeros((columns * rows, 1, 3), dtype=np.float32)
@@ -80,6 +93,7 @@ def calibrate_lens(
     points = [board] * len(boards)
     try:
         if fisheye:
+            focal_deviation = 0.0  # OpenCV does not give it
             found = cv2.fisheye.calibrate(
                 [each.astype(np.float64).reshape(1, -1, 3) for each in points],
                 [each.astype(np.float64).reshape(1, -1, 2) for each in boards],
@@ -89,12 +103,16 @@ def calibrate_lens(
                 flags=sum(getattr(cv2.fisheye, name, None) or getattr(cv2, name) for name in FISHEYE_FLAGS),
             )
         else:
-            found = cv2.calibrateCamera(points, list(boards), picture_px, None, None)
+            start = np.eye(3), np.zeros((5, 1))
+            rms, lens, bend, turns, moves, deviations, _, _ = cv2.calibrateCameraExtended(
+                points, list(boards), picture_px, *start
+            )
+            found = rms, lens, bend, turns, moves
+            focal_deviation = float(np.ravel(np.asarray(deviations))[0])
     except cv2.error as error:
-        raise UserError(
-            f"OpenCV cannot calibrate the lens with these boards ({error.err}): take more, from different directions"
-        ) from error
+        raise UserError(f"OpenCV cannot calibrate the lens with these boards ({error.err}): {MORE_BOARDS}") from error
     rms_px, matrix, distortion, turned, moved = found
+    _check_lens(float(rms_px), np.asarray(matrix, dtype=np.float64), focal_deviation, picture_px)
     project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
     board_rms_px = []
     for corners, turn, move in zip(boards, turned, moved, strict=True):
@@ -108,6 +126,34 @@ def calibrate_lens(
         float(rms_px),
         tuple(board_rms_px),
     )
+
+
+def different_boards(boards: Sequence[Corners], width_px: int) -> int:
+    """Return how many boards are not the same as another one."""
+    kept: list[Corners] = []
+    for board in boards:
+        if all(np.linalg.norm(board - other, axis=-1).mean() > SAME_BOARD_SHARE * width_px for other in kept):
+            kept.append(board)
+    return len(kept)
+
+
+def _check_lens(
+    rms_px: float, matrix: NDArray[np.float64], focal_deviation_px: float, picture_px: tuple[int, int]
+) -> None:
+    """Raise `UserError` for a lens that cannot be, or that the boards do not determine."""
+    width_px, height_px = picture_px
+    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+    reason = ""
+    if not (np.isfinite(matrix).all() and min(fx, fy) > 0 and rms_px <= MAX_RMS_SHARE * width_px):
+        reason = f"it misses the corners by {rms_px:.3g} px (RMS)"
+    elif focal_deviation_px > MAX_FOCAL_DEVIATION * fx:
+        reason = f"the focal length of {fx:.0f} px is uncertain by {focal_deviation_px:.0f} px"
+    elif not all(MIDDLE_SHARES[0] <= share <= MIDDLE_SHARES[1] for share in (cx / width_px, cy / height_px)):
+        reason = f"the middle of the lens would be at {cx:.0f}, {cy:.0f} px"
+    elif not 1 / MAX_FOCAL_RATIO <= fx / fy <= MAX_FOCAL_RATIO or 2 * math.atan(width_px / 2 / fx) < MIN_FIELD_RAD:
+        reason = f"the focal lengths would be {fx:.3g} and {fy:.3g} px"
+    if reason:
+        raise UserError(f"these boards do not determine the lens, because {reason}: {MORE_BOARDS}")
 
 
 def covered_shares(boards: Sequence[Corners], picture_px: tuple[int, int]) -> tuple[float, float]:

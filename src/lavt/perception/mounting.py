@@ -20,6 +20,10 @@ from lavt.perception.calibration import CalibratedCamera, axes, picture_points
 
 MIN_SEPARATION_RAD = math.radians(3)
 """The planes through the camera and each line must differ by at least this angle."""
+MIN_LENGTH_M = 4.0
+"""The given points of a line are at least this far apart along the road: from closer ones, the direction is a guess."""
+MIN_LENGTH_SHARE = 0.05
+"""The same in the picture, as a share of its height."""
 DRAWN_TO_M = 60.0
 """How far the lines are drawn."""
 BAR_STEP_M = 5.0
@@ -58,6 +62,9 @@ def find_mounting(camera: CalibratedCamera, left_px: FloatArray, right_px: Float
     """
     if min(len(left_px), len(right_px)) < 2:
         raise UserError("each line needs at least two points: one near, and one as far as you see it")
+    for name, pixels in (("--left", left_px), ("--right", right_px)):
+        if np.linalg.norm(np.ptp(pixels, axis=0)) < MIN_LENGTH_SHARE * camera.height_px:
+            raise UserError(f"the points of {name} are too close together: give one near, and one as far as you see it")
     rays = [rays_of(camera, pixels) for pixels in (left_px, right_px)]
     normals = [np.linalg.svd(line / np.linalg.norm(line, axis=1)[:, None])[2][2] for line in rays]
     ahead = np.cross(normals[0], normals[1])
@@ -78,6 +85,14 @@ def find_mounting(camera: CalibratedCamera, left_px: FloatArray, right_px: Float
         raise UserError("the left line is to the right of the right line: exchange --left and --right")
     height_m = distance_m / (left_side - right_side)
     deviation_m = height_m * max(float(np.abs(side - np.mean(side)).max()) for side in sides)
+    for name, line in zip(("--left", "--right"), rays, strict=True):
+        directions = line @ axes(turned)
+        length_m = height_m * float(np.ptp(directions[:, 0] / -directions[:, 2]))
+        if length_m < MIN_LENGTH_M:
+            raise UserError(
+                f"the points of {name} are {length_m:.1f} m apart along the road, but at least {MIN_LENGTH_M:g} m are "
+                "needed: give one near, and one as far as you see it"
+            )
     mounted = replace(turned, z_m=height_m)
     y_m = (mounted.y_m + height_m * left_side, mounted.y_m + height_m * right_side)
     return Mounting(mounted, y_m, deviation_m)

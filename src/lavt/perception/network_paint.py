@@ -58,7 +58,7 @@ class NetworkPaint:
             :, None, None
         ]
         if not model.is_file():
-            raise UserError(f"there is no file {model}: correct the key model")
+            raise UserError(f"{model} is not a file: correct the key model")
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the messages below have one sentence each
         try:
             self._network = cv2.dnn.readNetFromONNX(str(model))
