@@ -40,8 +40,9 @@ class StandIn:
     process: subprocess.Popen[str]
 
     def freeze(self) -> None:
-        """Stop the process without ending it."""
+        """Stop the process without ending it, and wait until it has stopped."""
         self.process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, self.process.pid, os.WSTOPPED | os.WNOWAIT)
 
     def resume(self) -> None:
         """Continue a frozen process."""

@@ -60,13 +60,13 @@ def outcomes(log: dict[str, Any]) -> dict[str, bool | None]:
 
 
 def test_the_check_writes_a_log(
-    server: StandIn, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    server: StandIn, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """With LAVT's own car all items pass, among them the contract and a drive of the lane keeper; nothing is left."""
     monkeypatch.chdir(tmp_path)
     options = ("--port", str(server.port), *SIZE, *TIMEOUT, "--set", "vehicle.time_limit_s=6")
     code = run(monkeypatch, "check", "127.0.0.1", *options)
-    output = capsys.readouterr()
+    output = capfd.readouterr()
     assert code == 0, output
     log = json.loads((tmp_path / "carla-check" / "log.json").read_text())
     assert outcomes(log) == dict.fromkeys(ITEMS, True)
@@ -80,14 +80,14 @@ def test_the_check_writes_a_log(
 
 
 def test_failed_items_and_items_that_were_not_run_are_named(
-    server: StandIn, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    server: StandIn, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """A wrong steering ratio fails its items, and a route that is not in the town is not run; the log has all of it."""
     changes = ("--set", "vehicle.carla.max_steering_deg=58.8", "--set", "vehicle.route=c")
     out = tmp_path / "out"
     options = ("--port", str(server.port), *SIZE, *TIMEOUT, *changes, "--out", str(out))
     assert run(monkeypatch, "check", "127.0.0.1", *options) == 1
-    printed = capsys.readouterr().out
+    printed = capfd.readouterr().out
     found = outcomes(json.loads((out / "log.json").read_text()))
     assert {name for name, passed in found.items() if passed is False} == {
         "contract: follows commands",
@@ -100,7 +100,7 @@ def test_failed_items_and_items_that_were_not_run_are_named(
 
 
 def test_a_server_that_dies_during_the_check_still_gives_a_log(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """If the server is killed, the items after that fail or are not run, with reasons, and the log is written."""
     with stand_in("--scenery", "none", "--camera", *PICTURE) as server:
@@ -108,19 +108,19 @@ def test_a_server_that_dies_during_the_check_still_gives_a_log(
         options = ("--port", str(server.port), *SIZE, "--set", "vehicle.carla.tick_timeout_s=1.0")
         out = tmp_path / "out"
         assert run(monkeypatch, "check", "127.0.0.1", *options, *TIMEOUT, "--out", str(out)) == 1
-    assert "FAILED   driving: the CARLA server at 127.0.0.1" in capsys.readouterr().out
+    assert "FAILED   driving: the CARLA server at 127.0.0.1" in capfd.readouterr().out
     found = outcomes(json.loads((out / "log.json").read_text()))
     failed = {"driving": False, "steering": False, "pictures and latency": None, "drive of the lane keeper": None}
     assert found == {"connection": True, **failed}
 
 
 def test_calibration_finds_the_steering_ratio(
-    server: StandIn, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    server: StandIn, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """With a largest angle that is twice the true one, the calibration prints about the true one, 29.4 degrees."""
     options = ("--port", str(server.port), "--set", "vehicle.carla.max_steering_deg=58.8", *TIMEOUT)
     assert run(monkeypatch, "calibrate", "127.0.0.1", *options) == 0
-    last = capsys.readouterr().out.splitlines()[-1]
+    last = capfd.readouterr().out.splitlines()[-1]
     name, value = last.split(": ")
     assert name == "vehicle.carla.max_steering_deg"
     assert float(value) == pytest.approx(29.4, rel=0.05)

@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
@@ -50,9 +51,9 @@ def server() -> Iterator[StandIn]:
 
 
 @contextmanager
-def driving(port: int) -> Iterator[CarlaSession]:
+def driving(port: int, **changes: object) -> Iterator[CarlaSession]:
     """Open a session, and drive for a second."""
-    with closing(CarlaSession(blind_settings(port, tick_timeout_s=TIMEOUT_S, timeout_s=20.0)[0])) as opened:
+    with closing(CarlaSession(blind_settings(port, tick_timeout_s=TIMEOUT_S, timeout_s=20.0, **changes)[0])) as opened:
         for _ in range(30):
             opened.tick(FULL_THROTTLE)
         yield opened
@@ -229,6 +230,40 @@ def test_a_camera_that_another_client_destroyed_ends_the_run() -> None:
             with pytest.raises(VehicleError, match="the camera is gone"):
                 setup.camera.capture(2, 2 * NS_PER_S, None)
         assert server.ask("actors") == ""
+
+
+def test_a_car_that_another_client_destroyed_ends_the_run(server: StandIn) -> None:
+    """Without the car, the next tick fails with a sentence, and at the end the server is left as it was."""
+    with driving(server.port) as opened:
+        assert server.ask("destroy", CAR) == "True"
+        with pytest.raises(VehicleError, match="the car is gone"):
+            opened.tick(FULL_THROTTLE)
+    assert server.ask("settings") == "False [False]"
+
+
+def test_a_tick_of_another_length_ends_the_run(server: StandIn) -> None:
+    """A server that advances its world by another time than it was told is named, and no result is made from it."""
+    with driving(server.port) as opened:
+        opened.settings = replace(opened.settings, tick_s=0.9 * opened.settings.tick_s)
+        with pytest.raises(VehicleError, match=r"advances its world by 0\.\d+ s in a tick instead of"):
+            opened.tick(FULL_THROTTLE)
+
+
+def test_a_session_leaves_a_world_that_another_client_ticks_frozen() -> None:
+    """A session that ends while another client ticks does not let the world run: that client's car would drive on."""
+    with stand_in() as server:
+        with driving(server.port) as opened:
+            opened._world.tick(20.0)  # as another client would
+        assert server.ask("actors") == ""
+        assert server.ask("settings").startswith("True")
+
+
+def test_an_unknown_host_is_named() -> None:
+    """A host whose name cannot be resolved gives the sentence of an absent server."""
+    need_carla()
+    settings = replace(blind_settings(2000)[0], host="nowhere.invalid")
+    with pytest.raises(UserError, match=r"no CARLA server answers at nowhere\.invalid"):
+        CarlaSession(settings)
 
 
 def test_a_second_ticking_client_is_refused(server: StandIn) -> None:

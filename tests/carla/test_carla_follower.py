@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 from itertools import pairwise
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,13 +14,14 @@ from hypothesis import strategies as st
 from lavt.config import RunConfig
 from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, Now
-from lavt.errors import UserError
+from lavt.errors import UserError, VehicleError
 from lavt.experiment.runs.plan import plan_run
 from lavt.vehicle.carla import guard as guarding
 from lavt.vehicle.carla.follower import CALIBRATION_TICKS, RESEND_NS, Follower
 from lavt.vehicle.carla.frames import FlatPose
+from lavt.vehicle.carla.plausible import SentControls, checked
 from lavt.vehicle.carla.settings import CarlaEvent, Snapshot
-from lavt.vehicle.carla.ticks import SILENCE_NS
+from lavt.vehicle.carla.ticks import FULL_BRAKE, SILENCE_NS
 from lavt.vehicle.carla.world_time import WINDOW_NS, WorldTime
 
 START_NS = 5 * NS_PER_S
@@ -113,6 +116,50 @@ def test_the_first_states_only_give_the_time() -> None:
     found = follower.wait_for_frame(CALIBRATION_TICKS + 5, 0.0)
     assert found == ticked[1]
     assert follower.wait_for_frame(CALIBRATION_TICKS + 3, 0.0) is None
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("field", ["pose", "speed_mps", "steering_rad", "elapsed_s"])
+def test_values_that_are_not_finite_are_refused(field: str, value: float) -> None:
+    """A pose, speed, angle or time that is not finite is an error of the server, not a state of the car."""
+    wrong = FlatPose(value, 0.0, 0.0) if field == "pose" else value
+    with pytest.raises(VehicleError, match=r"here:1 reports .* not finite"):
+        checked(msgspec.structs.replace(snapshot(1, 0.1), **{field: wrong}), "here:1")
+    assert checked(snapshot(1, 0.1), "here:1") == snapshot(1, 0.1)
+
+
+@pytest.mark.parametrize(("speed_mps", "steering_rad"), [(1e30, 0.0), (0.0, math.pi / 2), (-200.0, 0.0)])
+def test_values_that_no_car_has_are_refused(speed_mps: float, steering_rad: float) -> None:
+    """A speed of 720 km/h or wheels across the car are an error of the server."""
+    wrong = msgspec.structs.replace(snapshot(1, 0.1), speed_mps=speed_mps, steering_rad=steering_rad)
+    with pytest.raises(VehicleError, match="which no car can have"):
+        checked(wrong, "here:1")
+
+
+def test_a_control_that_was_not_sent_is_noticed() -> None:
+    """The control in force may be one of the last half second or the guard's; another one means a lost connection."""
+    sent = SentControls()
+    sent.check(0.0, 0.7, 0.0, "here:1")  # nothing has been sent yet
+    for number in range(10):
+        sent.note(0.1 * number, 0.5, 0.0)
+        sent.check(0.1 * number, 0.5, 0.0, "here:1")
+        sent.check(0.1 * number, 0.0, 1.0, "here:1")
+    for number in range(10, 15):
+        sent.note(0.1 * number, 0.0, 1.0)
+        sent.check(0.1 * number, 0.5, 0.0, "here:1")  # the old one is still on its way
+    sent.note(1.5, 0.0, 1.0)
+    with pytest.raises(VehicleError, match=r"does not do what it is told \(throttle 0\.50, brake 0\.00\)"):
+        sent.check(1.5, 0.5, 0.0, "here:1")
+
+
+def test_a_follower_that_fails_brakes_and_stops_beating() -> None:
+    """The error of one thread sends the full brake, ends the other thread, and is raised to the actuator."""
+    world = RecordedWorld()
+    follower = Follower(world)
+    follower._fail(VehicleError("the connection is lost"))
+    assert world.applied[-1] == (FULL_BRAKE, False)
+    with pytest.raises(VehicleError, match="the connection is lost"):
+        follower.tick_until(START_NS)
 
 
 def test_a_command_is_sent_at_once_and_repeated() -> None:

@@ -21,6 +21,7 @@ from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig, ServerCameraConfig, ServerConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
+from lavt.errors import VehicleError
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.run import run_once
 from lavt.recording.record import read_record
@@ -163,12 +164,13 @@ def test_the_car_is_braked_when_commands_stop(server: StandIn) -> None:
         assert vehicle.counts["carla_silences"] >= 1  # type: ignore[attr-defined]
 
 
-def test_without_its_guard_a_car_does_not_drive(server: StandIn) -> None:
-    """If the guard ends, the actuator fails, which ends the run; closing then brakes and removes the car."""
+@pytest.mark.parametrize(("number", "reason"), [(signal.SIGKILL, "has ended"), (signal.SIGSTOP, "does not answer")])
+def test_without_its_guard_a_car_does_not_drive(server: StandIn, number: signal.Signals, reason: str) -> None:
+    """If the guard ends or hangs, the actuator fails, which ends the run; closing then brakes and removes the car."""
     with opened(server.port) as (_, vehicle):
         drive_on(vehicle, until_mps=FAST_MPS)
         guard = int(subprocess.check_output(["pgrep", "-f", "lavt.vehicle.carla.guard.*" + str(server.port)]))
-        os.kill(guard, signal.SIGKILL)
-        with pytest.raises(Exception, match="has ended"):
+        os.kill(guard, number)
+        with pytest.raises(VehicleError, match=reason):
             drive_on(vehicle)
     assert server.ask("actors") == ""

@@ -132,7 +132,7 @@ def build_carla(config: ServerConfig) -> VehicleSetup:
             ticker.stop()
         session.close()
         for guard in guards:  # last: until here it brakes if this process dies
-            guard.end()
+            guard.end(is_car_gone=session.is_car_gone)
 
     route = route_of(config.vehicle.route, road)
     return VehicleSetup(camera, start, route, simulated=True, run=run, close=close)

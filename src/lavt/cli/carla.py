@@ -28,6 +28,7 @@ from lavt.vehicle.carla.check import (
     check_vehicle_contract,
     describe_times,
     measure_steering,
+    steering_disagreement,
     steering_share,
     time_ticks,
 )
@@ -72,7 +73,7 @@ def check(
     check_directory(out)
     run = _config(host, port, changes)
     log: dict[str, Any] = {"settings": {"host": host, "port": port, "set": changes or []}, "provenance": provenance()}
-    with _session(run, with_camera=False) as session:  # pictures would only cost time
+    with console.interruptible(), _session(run, with_camera=False) as session:  # pictures would only cost time
         prepare_directory(out)
         checks = [
             CarlaCheck(
@@ -101,7 +102,7 @@ def calibrate(host: Host = "127.0.0.1", port: Port = 2000, changes: console.SetO
 
     Example: lavt carla calibrate 192.0.2.7
     """
-    with _session(_config(host, port, changes), with_camera=False) as session:
+    with console.interruptible(), _session(_config(host, port, changes), with_camera=False) as session:
         steps = measure_steering(session)
         for step in steps:
             console.print_result(
@@ -109,8 +110,8 @@ def calibrate(host: Host = "127.0.0.1", port: Port = 2000, changes: console.SetO
                 f"{step.driven_rad:+.4f} rad"
             )
         share = steering_share(steps)
-        if share <= 0.0:
-            raise WorkError("the car did not turn to the commanded side: check the place where it was spawned")
+        if disagreement := steering_disagreement(steps):
+            raise WorkError(f"{disagreement}: check the place where the car was spawned")
         console.print_result(f"vehicle.carla.max_steering_deg: {math.degrees(session.max_steering_rad) * share:.2f}")
 
 

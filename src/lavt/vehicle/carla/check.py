@@ -33,6 +33,8 @@ STEER_STEPS_RAD: Final = (0.04, -0.04, 0.08, -0.08)
 STEERING_TOLERANCE: Final = 0.1
 """The relative difference between commanded and driven steering angle that the check accepts."""
 STATIONARY_MPS: Final = 0.05
+MIN_BRAKED_MPS, MIN_BRAKING_MPS2 = 4.0, 3.0
+"""The check of the brake begins at least at this speed, and expects at least this deceleration."""
 TIMED_TICKS: Final = 100
 CONTRACT_LIMITS: Final = ContractLimits(
     speed_mps=(0.3, 15.0), full_throttle_mps=0.5, steering_tolerance_rad=0.02, stop_s=6.0
@@ -111,8 +113,8 @@ def check_driving(session: CarlaSession) -> list[CarlaCheck]:
         ticks += 1
     braking = before / max(ticks * session.settings.tick_s, session.settings.tick_s)
     stays = _drive(session, BRAKED, 1.0)
-    is_stationary = abs(stays.speed_mps) < STATIONARY_MPS
-    brakes = CarlaCheck("brake", is_stationary, f"{braking:.2f} m/s2 on average from {before:.1f} m/s with brake 1")
+    is_braked = abs(stays.speed_mps) < STATIONARY_MPS and before >= MIN_BRAKED_MPS and braking >= MIN_BRAKING_MPS2
+    brakes = CarlaCheck("brake", is_braked, f"{braking:.2f} m/s2 on average from {before:.1f} m/s with brake 1")
     return [rests, pulls, brakes]
 
 
@@ -142,6 +144,17 @@ def check_steering(steps: Sequence[StepSteer]) -> list[CarlaCheck]:
 def steering_share(steps: Sequence[StepSteer]) -> float:
     """Return the median ratio of driven and commanded angles."""
     return median(step.driven_rad / step.commanded_rad for step in steps)
+
+
+def steering_disagreement(steps: Sequence[StepSteer]) -> str:
+    """Return why no single factor describes the steps; empty if one does."""
+    share = steering_share(steps)
+    if share <= 0.0:
+        return "the car did not turn to the commanded side"
+    shares = [step.driven_rad / step.commanded_rad for step in steps]
+    if any(abs(each / share - 1.0) > STEERING_TOLERANCE for each in shares):
+        return f"the steps disagree: driven and commanded angle have ratios from {min(shares):.3f} to {max(shares):.3f}"
+    return ""
 
 
 def time_ticks(session: CarlaSession, clock: Clock, count: int = TIMED_TICKS) -> TickTimes:

@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from typing import Any, Final, NamedTuple
 
 from lavt.errors import UserError, VehicleError
+from lavt.vehicle.carla.frames import CarlaPose
 from lavt.vehicle.carla.library import SUPPORTED
 from lavt.vehicle.carla.settings import CarlaSettings
 
@@ -35,12 +36,17 @@ class OpenedWorld(NamedTuple):
     world: Any
     settings: Any
     weather: Any
+    is_asynchronous: bool = False
 
     def restore(self, *, has_own_weather: bool) -> None:
-        """Restore the settings and the weather; the world then runs as it did before."""
+        """Restore the settings and the weather; the world then runs as it did before.
+
+        If another client has made an asynchronous world synchronous, it stays so: its car could drive on.
+        """
         if has_own_weather:
             self.world.set_weather(self.weather)
-        self.world.apply_settings(self.settings)
+        if self.world.get_settings().synchronous_mode != self.is_asynchronous:
+            self.world.apply_settings(self.settings)
 
 
 @contextmanager
@@ -58,8 +64,8 @@ def sentences(settings: CarlaSettings, work: str) -> Iterator[None]:
 
 def connect(carla: Any, settings: CarlaSettings) -> Any:
     """Return a client; raise `UserError` if no server answers, or one of another version."""
-    client = _find_client(carla, settings)
     try:
+        client = _find_client(carla, settings)  # which looks up the host's name
         found = client.get_server_version()
     except RuntimeError:
         forget_client(settings)
@@ -113,12 +119,26 @@ def open_world(carla: Any, client: Any, settings: CarlaSettings) -> OpenedWorld:
                 world.set_weather(weather)
             if settings.is_asynchronous:  # only now, because a killed run's car could drive on
                 world.apply_settings(_asynchronous(carla, world.get_settings()))
+                opened = opened._replace(is_asynchronous=True)
         except BaseException:
             if may_run:  # a world that was found frozen may hold the car of a killed run, which would drive on
                 with suppress(RuntimeError):
                     opened.restore(has_own_weather=False)
             raise
     return opened
+
+
+def to_transform(carla: Any, pose: CarlaPose) -> Any:
+    """Return a pose as the package's transform."""
+    return carla.Transform(
+        carla.Location(pose.x_m, pose.y_m, pose.z_m), carla.Rotation(pose.pitch_deg, pose.yaw_deg, pose.roll_deg)
+    )
+
+
+def to_pose(transform: Any) -> CarlaPose:
+    """Return the package's transform as a pose."""
+    location, rotation = transform.location, transform.rotation
+    return CarlaPose(location.x, location.y, location.z, rotation.pitch, rotation.yaw, rotation.roll)
 
 
 def town_of(world: Any) -> str:

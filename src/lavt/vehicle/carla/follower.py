@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Final, Protocol
 
 from lavt.clock import Clock
@@ -150,7 +151,7 @@ class Follower(TickHistory):
 
     def _send(self, clock: Clock) -> None:
         try:
-            while not self._stopped.is_set():
+            while not self._stopped.is_set() and self._failed is None:  # then the guard brakes, too
                 with self._commanded:
                     self._commanded.wait_for(lambda: self._is_new, SENDING_PERIOD_S)
                 self.send(clock.now().mono_ns)
@@ -158,6 +159,8 @@ class Follower(TickHistory):
             self._fail(error)
 
     def _fail(self, error: BaseException) -> None:
+        with suppress(RuntimeError):  # the server may be gone
+            self._world.apply(FULL_BRAKE)
         with self._changed:
             self._failed = error
             self._changed.notify_all()

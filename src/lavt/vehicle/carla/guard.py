@@ -15,7 +15,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
 
-from lavt.clock import pause
+from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, VehicleError
 from lavt.vehicle.carla.connection import connect
@@ -34,6 +34,12 @@ MIN_BRAKINGS, MAX_BRAKINGS = 10, 600
 and at most this often, because the server may be dead, too."""
 STATIONARY_MPS: Final = 0.05
 START_TIMEOUT_S: Final = 30.0
+END_TIMEOUT_S: Final = 2.0
+MAX_UNANSWERED: Final = 150
+"""The guard answers what it reads. After so many beats without an answer, one to three seconds, it is not there."""
+CALL_NS: Final = NS_PER_S
+"""The guard asks the server something this often, because a lost connection shows only in an answer."""
+CALL_TIMEOUT_S: Final = 1.0
 
 
 class Guard:
@@ -56,34 +62,50 @@ class Guard:
         if line != READY:
             self.end()
             raise VehicleError("the guard, which brakes the car if LAVT dies, did not find the car: restart CARLA")
-        os.set_blocking(self._input.fileno(), False)
+        for pipe in (self._input, self._output):
+            os.set_blocking(pipe.fileno(), False)
+        self._unanswered = 0
 
     def beat(self) -> None:
-        """Tell the guard that this process is alive; raise `VehicleError` if the guard has ended."""
-        if self._input is None or self._process.poll() is not None:
+        """Tell the guard that this process is alive; raise `VehicleError` if the guard has ended or does not answer."""
+        if self._input is None or self._output is None or self._process.poll() is not None:
             raise VehicleError("the guard, which brakes the car if LAVT dies, has ended: start the run again")
         with suppress(BlockingIOError, BrokenPipeError):  # full: the guard is frozen; broken: the next call raises
             os.write(self._input.fileno(), BEAT)
+        with suppress(BlockingIOError):
+            self._unanswered += 1
+            if os.read(self._output.fileno(), 4096):
+                self._unanswered = 0
+        if self._unanswered > MAX_UNANSWERED:
+            raise VehicleError(
+                "the guard, which brakes the car if LAVT dies, does not answer, or the server does not answer it: "
+                "start the run again"
+            )
 
-    def end(self) -> None:
-        """End the guard without braking."""
+    def end(self, *, is_car_gone: bool = True) -> None:
+        """End the guard; if the car is still there, the guard first brakes it until it is stationary."""
         if self._input is None or self._output is None:
             return
-        with suppress(OSError):
-            os.write(self._input.fileno(), FAREWELL)
+        if is_car_gone:
+            with suppress(OSError):
+                os.write(self._input.fileno(), FAREWELL)
         for pipe in (self._input, self._output):
             with suppress(OSError):
                 pipe.close()
         self._input = self._output = None
+        if not is_car_gone:
+            return
         try:
-            self._process.wait(START_TIMEOUT_S)
+            self._process.wait(END_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
 
 
-def guard(beats: int, brake: Callable[[], bool]) -> None:
+def guard(beats: int, brake: Callable[[], bool], answer: Callable[[], None] = lambda: None) -> None:
     """Brake while nothing can be read from the file descriptor `beats`; return after a farewell.
+
+    `answer` is called after each reading.
 
     At the end of the pipe, brake until the car is stationary, at most for a minute, and return. `brake` brakes once,
     and returns whether the car is stationary.
@@ -100,6 +122,7 @@ def guard(beats: int, brake: Callable[[], bool]) -> None:
             return
         if not text:
             break
+        answer()
         timeout_s = BEAT_TIMEOUT_S
     for count in range(1, MAX_BRAKINGS + 1):
         if brake() and count >= MIN_BRAKINGS:
@@ -136,9 +159,19 @@ def main() -> int:
         car = client.get_world().get_actor(int(number))
         if car is None:
             return 1
-        sys.stdout.buffer.write(READY)
-        sys.stdout.flush()
-        guard(sys.stdin.fileno(), CarBrake(carla, car))
+        client.set_timeout(CALL_TIMEOUT_S)
+        clock, called_ns = MachineClock(), 0
+
+        def answer() -> None:
+            nonlocal called_ns
+            if (now_ns := clock.now().mono_ns) - called_ns >= CALL_NS:
+                client.get_server_version()
+                called_ns = now_ns
+            with suppress(OSError):
+                os.write(sys.stdout.fileno(), BEAT)
+
+        os.write(sys.stdout.fileno(), READY)
+        guard(sys.stdin.fileno(), CarBrake(carla, car), answer)
     except (LavtError, RuntimeError):  # the server is gone, and with it the car
         return 1
     return 0

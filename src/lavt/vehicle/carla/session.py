@@ -16,7 +16,15 @@ from typing import Any, Final
 
 from lavt.domain import Actuation, CameraModel
 from lavt.errors import UserError, VehicleError
-from lavt.vehicle.carla.connection import OpenedWorld, connect, open_world, sentences, town_of
+from lavt.vehicle.carla.connection import (
+    OpenedWorld,
+    connect,
+    open_world,
+    sentences,
+    to_pose,
+    to_transform,
+    town_of,
+)
 from lavt.vehicle.carla.frames import (
     Axles,
     CarlaPose,
@@ -32,6 +40,7 @@ from lavt.vehicle.carla.frames import (
 )
 from lavt.vehicle.carla.library import load_library
 from lavt.vehicle.carla.pictures import PictureBox
+from lavt.vehicle.carla.plausible import SentControls, check_finite, check_tick, checked
 from lavt.vehicle.carla.settings import CarlaEvent, CarlaSettings, Snapshot
 
 SPAWN_HEIGHT_M: Final = 0.3
@@ -69,11 +78,15 @@ class CarlaSession:
         """The spawned actors, in order."""
         self._opened: OpenedWorld | None = None
         self._is_closed = False
+        self.is_car_gone = False
+        """Whether `close` has removed the car."""
         self._axles = Axles(GUESSED_REAR_AXLE_M, 1.0)
         self._max_steering_rad = 1.0
         self._steering_curve: tuple[tuple[float, float], ...] = ()
         self._frame = 0
         self._dither = 0.0
+        self._sent = SentControls()
+        self._elapsed_s = 0.0
         self._start = FlatPose(0.0, 0.0, 0.0)
         self._client = connect(self._carla, settings)
         atexit.register(self.close)
@@ -101,62 +114,64 @@ class CarlaSession:
         return self._max_steering_rad
 
     @property
-    def snapshot(self) -> Snapshot:
-        """The car after the newest tick."""
-        return self._snapshot
-
-    @property
     def car_number(self) -> int:
         """The number of the car among the server's actors."""
         return int(self._car.id)
 
     def tick(self, actuation: Actuation, *, hand_brake: bool = False) -> Snapshot:
-        """Advance the world by one tick under an actuation and return the car after it.
-
-        An asynchronous world advances by itself; then wait for its next state.
-        """
+        """Advance the world by one tick, or wait for the next one of an asynchronous world; return the car after it."""
         if self.settings.is_asynchronous:
             self.apply(actuation, hand_brake=hand_brake)
-            self._snapshot = self.wait_for_state()
-            return self._snapshot
+            self.snapshot = self.wait_for_state()
+            return self.snapshot
         with sentences(self.settings, "complete a tick"):
             self.apply(actuation, hand_brake=hand_brake)
             before, self._frame = self._frame, self._world.tick(self.settings.tick_timeout_s)
-            self._snapshot = self._read()
+            state = self._world.get_snapshot()
         if before and self._frame != before + 1:
             raise VehicleError(
                 f"the CARLA server at {self.settings.address} went from frame {before} to {self._frame} in one tick: "
                 "end the other client that ticks it"
             )
-        return self._snapshot
+        check_tick(state.timestamp.delta_seconds, self.settings.tick_s, self.settings.address)
+        if before and state.find(self._car.id) is None:
+            raise self._car_is_gone()
+        with sentences(self.settings, "report the car"):
+            self.snapshot = checked(self._read(), self.settings.address)
+        return self.snapshot
 
     def wait_for_state(self) -> Snapshot:
         """Return the car in the next state of an asynchronous world; raise `VehicleError` if none comes.
 
-        The steering angle is that of the control in force: to ask for the wheels' own would stop all threads for as
-        long as the server needs to answer.
+        The steering angle is that of the control: to ask for the wheels' own would stop all threads during the request.
         """
         with sentences(self.settings, "send a state"):
             state = self._world.wait_for_tick(self.settings.tick_timeout_s)
             car = state.find(self._car.id)
             if car is None and self._frame:
-                raise VehicleError(
-                    f"the car is gone from the CARLA server at {self.settings.address}: end the other client that "
-                    "destroyed it"
-                )
+                raise self._car_is_gone()
             pose, velocity = CarlaPose(0.0, 0.0, 0.0), (0.0, 0.0)
             if car is not None:
                 self._frame = state.frame
-                pose, vector = _pose(car.get_transform()), car.get_velocity()
+                pose, vector = to_pose(car.get_transform()), car.get_velocity()
                 velocity = (vector.x, vector.y)
             control = self._car.get_control()
-        return Snapshot(
+        self._elapsed_s = state.timestamp.elapsed_seconds
+        self._sent.check(self._elapsed_s, control.throttle, control.brake, self.settings.address)
+        check_finite((pose.yaw_deg, *velocity), self.settings.address)
+        snapshot = Snapshot(
             state.frame,
             rear_axle_pose(pose, self._axles.rear_axle_m, self.settings.map_shift_m),
             forward_speed_mps(velocity, pose.yaw_deg),
             -control.steer * self._max_steering_rad * self._curve_factor(math.hypot(*velocity)),
             control.gear,
-            state.timestamp.elapsed_seconds,
+            self._elapsed_s,
+        )
+        return checked(snapshot, self.settings.address)
+
+    def _car_is_gone(self) -> VehicleError:
+        return VehicleError(
+            f"the car is gone from the CARLA server at {self.settings.address}: end the other client that destroyed it"
         )
 
     def ask_version(self) -> str:
@@ -188,17 +203,18 @@ class CarlaSession:
     def reset(self) -> None:
         """Put the car, stationary, with its rear axle exactly at the start."""
         with sentences(self.settings, "place the car"):
-            now = _pose(self._car.get_transform())
+            now = to_pose(self._car.get_transform())
             pose = actor_pose(self._start, self._axles.rear_axle_m, self.settings.map_shift_m, now.z_m)
             self._car.set_target_velocity(self._carla.Vector3D())
-            self._car.set_transform(_transform(self._carla, pose._replace(pitch_deg=now.pitch_deg)))
+            self._car.set_transform(to_transform(self._carla, pose._replace(pitch_deg=now.pitch_deg)))
         self._settle()
 
     def close(self) -> None:
         """Destroy the actors in reverse order and restore the world's settings.
 
         The settings come last, because with them the world may run by itself again. If the server does not answer or
-        the car stays, the world stays frozen, with the rest of the actors, until the next session removes them.
+        the car stays, the world stays frozen, with the rest of the actors, until the next session removes them;
+        `is_car_gone` then is false.
         """
         if self._is_closed:
             return
@@ -206,16 +222,21 @@ class CarlaSession:
         atexit.unregister(self.close)
         with suppress(RuntimeError):
             self._client.set_timeout(CLOSE_TIMEOUT_S)
-            if self._actors:  # before anything else, because a car in an asynchronous world drives on
-                self.apply(BRAKED, hand_brake=True)
+            for car in self._actors[:1]:  # before anything else, because a car in an asynchronous world drives on
+                car.apply_control(self._carla.VehicleControl(brake=1.0, hand_brake=True))
             for actor in reversed(self._actors):
                 if actor.type_id.startswith("sensor."):
                     actor.stop()
                     actor.destroy()  # whether it succeeds: another client may have destroyed it
-                elif not actor.destroy():
+                elif not actor.destroy() and any(other.id == actor.id for other in self._world.get_actors()):
                     return
-            if self._opened is not None:
+            self.is_car_gone = True
+            if self._opened is not None and not self._is_ticked_by_another():
                 self._opened.restore(has_own_weather=bool(self.settings.weather))
+
+    def _is_ticked_by_another(self) -> bool:
+        """Return whether another client has ticked the world since: if it ran by itself, that client's car drove on."""
+        return not self.settings.is_asynchronous and 0 < self._frame < self._world.get_snapshot().frame
 
     # The car.
 
@@ -224,7 +245,7 @@ class CarlaSession:
         with sentences(settings, "spawn the car"):
             town = self._world.get_map()
             if settings.start is None:
-                pose = _pose(next(iter(town.get_spawn_points()), self._carla.Transform()))
+                pose = to_pose(next(iter(town.get_spawn_points()), self._carla.Transform()))
                 self._start = rear_axle_pose(pose, GUESSED_REAR_AXLE_M, settings.map_shift_m)
             else:
                 self._start = settings.start
@@ -236,7 +257,7 @@ class CarlaSession:
                     f"{town_of(self._world)}: set vehicle.carla.town and vehicle.carla.map_shift_m, or another route"
                 )
             pose = pose._replace(z_m=lane.transform.location.z + SPAWN_HEIGHT_M)
-            car = self._world.try_spawn_actor(self._blueprint(settings.blueprint), _transform(self._carla, pose))
+            car = self._world.try_spawn_actor(self._blueprint(settings.blueprint), to_transform(self._carla, pose))
         if car is None:
             raise UserError(
                 f"the start is occupied in the CARLA server at {settings.address}: remove the other actor, or set "
@@ -257,7 +278,7 @@ class CarlaSession:
         """Read where the axles are, and how far the wheels turn."""
         blueprint = self.settings.blueprint
         with sentences(self.settings, "describe the car"):
-            physics, pose = self._car.get_physics_control(), _pose(self._car.get_transform())
+            physics, pose = self._car.get_physics_control(), to_pose(self._car.get_transform())
         wheels = [(wheel.position.x, wheel.position.y) for wheel in physics.wheels]
         if len(wheels) != 4:
             raise UserError(f"{blueprint} has {len(wheels)} wheels: set vehicle.carla.blueprint to a car with four")
@@ -274,7 +295,13 @@ class CarlaSession:
                 f"CARLA reports a largest steering angle of {math.degrees(announced_rad):.3g} degrees for {blueprint}: "
                 "set vehicle.carla.max_steering_deg"
             )
-        self._steering_curve = tuple((point.x, point.y) for point in physics.steering_curve)
+        curve = tuple((point.x, point.y) for point in physics.steering_curve)
+        if not all(math.isfinite(x) and 0.0 < y < math.inf for x, y in curve):
+            raise VehicleError(
+                f"CARLA reports a steering curve that is not above 0 for {blueprint}: set another "
+                "vehicle.carla.blueprint"
+            )
+        self._steering_curve = curve
 
     # Sensors.
 
@@ -314,7 +341,7 @@ class CarlaSession:
         )
 
     def _attach(self, blueprint: Any, pose: CarlaPose, listener: Callable[[Any], None]) -> None:
-        sensor = self._world.spawn_actor(blueprint, _transform(self._carla, pose), attach_to=self._car)
+        sensor = self._world.spawn_actor(blueprint, to_transform(self._carla, pose), attach_to=self._car)
         self._actors.append(sensor)
         sensor.listen(listener)
 
@@ -336,6 +363,7 @@ class CarlaSession:
         if self.settings.is_asynchronous:
             self._dither = STEER_DITHER - self._dither
             steer -= math.copysign(self._dither, steer)
+            self._sent.note(self._elapsed_s, actuation.throttle, actuation.brake)
         control = self._carla.VehicleControl(
             throttle=actuation.throttle,
             steer=steer,
@@ -351,7 +379,8 @@ class CarlaSession:
     def _read(self) -> Snapshot:
         wheel = self._carla.VehicleWheelLocation
         left_deg, right_deg = (self._car.get_wheel_steer_angle(place) for place in (wheel.FL_Wheel, wheel.FR_Wheel))
-        pose, velocity = _pose(self._car.get_transform()), self._car.get_velocity()
+        pose, velocity = to_pose(self._car.get_transform()), self._car.get_velocity()
+        check_finite((pose.yaw_deg, velocity.x, velocity.y, left_deg, right_deg), self.settings.address)
         return Snapshot(
             self._frame,
             rear_axle_pose(pose, self._axles.rear_axle_m, self.settings.map_shift_m),
@@ -366,14 +395,3 @@ class CarlaSession:
     def _note_lane_invasion(self, event: Any) -> None:
         marks = ", ".join(str(mark.type) for mark in event.crossed_lane_markings)
         self._events.append(CarlaEvent(event.frame, "lane_invasion", f"over {marks}"))
-
-
-def _transform(carla: Any, pose: CarlaPose) -> Any:
-    return carla.Transform(
-        carla.Location(pose.x_m, pose.y_m, pose.z_m), carla.Rotation(pose.pitch_deg, pose.yaw_deg, pose.roll_deg)
-    )
-
-
-def _pose(transform: Any) -> CarlaPose:
-    location, rotation = transform.location, transform.rotation
-    return CarlaPose(location.x, location.y, location.z, rotation.pitch, rotation.yaw, rotation.roll)
