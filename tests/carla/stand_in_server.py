@@ -9,8 +9,10 @@ ends. Only the genuine wheel `carla` 0.9.16 is used to talk to it.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import os
+import queue
 import socket
 import struct
 import sys
@@ -29,30 +31,53 @@ from lavt.vehicle.sim.road.road import load_road
 MAP_FILE = "OpenDrive"
 
 
+MAX_WAITING = 64
+"""So many messages wait for a subscriber that does not read; further ones are dropped for it."""
+
+
+class Subscriber:
+    """A client of a stream, with a thread that sends: a client that does not read must not stop the world."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._waiting: queue.Queue[bytes] = queue.Queue(MAX_WAITING)
+        self.is_gone = False
+        threading.Thread(target=self._send, daemon=True).start()
+
+    def put(self, data: bytes) -> None:
+        """Send data when the client reads."""
+        with contextlib.suppress(queue.Full):
+            self._waiting.put_nowait(data)
+
+    def _send(self) -> None:
+        try:
+            while True:
+                self._connection.sendall(self._waiting.get())
+        except OSError:
+            self.is_gone = True
+
+
 class Streams:
     """The subscribers of each stream."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._subscribers: dict[int, list[socket.socket]] = {}
+        self._subscribers: dict[int, list[Subscriber]] = {}
 
     def subscribe(self, connection: socket.socket) -> None:
         """Read the number of the stream that a client wants, and add the client."""
         number = connection.recv(4, socket.MSG_WAITALL)
         if len(number) == 4:
             with self._lock:
-                self._subscribers.setdefault(struct.unpack("<I", number)[0], []).append(connection)
+                self._subscribers.setdefault(struct.unpack("<I", number)[0], []).append(Subscriber(connection))
 
     def publish(self, stream: int, data: bytes) -> None:
         """Send data to all subscribers; forget those that are gone."""
         with self._lock:
-            subscribers = list(self._subscribers.get(stream, []))
+            subscribers = [each for each in self._subscribers.get(stream, []) if not each.is_gone]
+            self._subscribers[stream] = subscribers
         for subscriber in subscribers:
-            try:
-                subscriber.sendall(struct.pack("<I", len(data)) + data)
-            except OSError:
-                with self._lock:
-                    self._subscribers[stream].remove(subscriber)
+            subscriber.put(struct.pack("<I", len(data)) + data)
 
 
 class StandInServer:
