@@ -10,6 +10,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.support.clocks import ManualClock
 
 from lavt.config import RunConfig
 from lavt.config_file import parse_config
@@ -150,6 +151,40 @@ def test_a_control_that_was_not_sent_is_noticed() -> None:
     sent.note(1.5, 0.0, 1.0)
     with pytest.raises(VehicleError, match=r"does not do what it is told \(throttle 0\.50, brake 0\.00\)"):
         sent.check(1.5, 0.5, 0.0, "here:1")
+
+
+def test_a_guard_whose_server_is_silent_goes_on_without_answering() -> None:
+    """A beat is answered only if the server has answered within a second; its silence does not end the guard."""
+    clock, asked, is_silent = ManualClock(), 0, True
+
+    def ask_server() -> str:
+        nonlocal asked
+        asked += 1
+        if is_silent:
+            raise RuntimeError("time-out")
+        return "0.9.16"
+
+    reader, writer = os.pipe()
+    os.set_blocking(reader, False)
+    answer = guarding.BeatAnswer(ask_server, clock, writer)
+    try:
+        answer()
+        with pytest.raises(BlockingIOError):
+            os.read(reader, 10)
+        is_silent = False
+        answer()
+        answer()
+        assert (os.read(reader, 10), asked) == (guarding.BEAT * 2, 2)
+        clock.advance(guarding.CALL_NS / NS_PER_MS)
+        is_silent = True
+        answer()
+        with pytest.raises(BlockingIOError):
+            os.read(reader, 10)
+        os.close(reader)
+        is_silent = False
+        answer()
+    finally:
+        os.close(writer)
 
 
 def test_a_follower_that_fails_brakes_and_stops_beating() -> None:

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
 
-from lavt.clock import MachineClock, pause
+from lavt.clock import Clock, MachineClock, pause
 from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, VehicleError
 from lavt.vehicle.carla.connection import connect
@@ -105,10 +105,8 @@ class Guard:
 def guard(beats: int, brake: Callable[[], bool], answer: Callable[[], None] = lambda: None) -> None:
     """Brake while nothing can be read from the file descriptor `beats`; return after a farewell.
 
-    `answer` is called after each reading.
-
     At the end of the pipe, brake until the car is stationary, at most for a minute, and return. `brake` brakes once,
-    and returns whether the car is stationary.
+    and returns whether the car is stationary. `answer` is called after each reading.
     """
     timeout_s = BEAT_TIMEOUT_S
     while True:
@@ -128,6 +126,26 @@ def guard(beats: int, brake: Callable[[], bool], answer: Callable[[], None] = la
         if brake() and count >= MIN_BRAKINGS:
             break
         pause(round(REPEAT_S * NS_PER_S))
+
+
+class BeatAnswer:
+    """The answer to a beat: written if the server has answered this process lately.
+
+    Without it LAVT's process ends the run. The guard goes on, because it may be the last one that can brake.
+    """
+
+    def __init__(self, ask_server: Callable[[], object], clock: Clock, output: int) -> None:
+        self._ask_server, self._clock, self._output = ask_server, clock, output
+        self._asked_ns: int | None = None
+
+    def __call__(self) -> None:
+        """Ask the server every `CALL_NS`, and answer unless it is silent."""
+        now_ns = self._clock.now().mono_ns
+        with suppress(OSError, RuntimeError):  # LAVT's process is gone; the server does not answer
+            if self._asked_ns is None or now_ns - self._asked_ns >= CALL_NS:
+                self._ask_server()
+                self._asked_ns = now_ns
+            os.write(self._output, BEAT)
 
 
 class CarBrake:
@@ -160,17 +178,8 @@ def main() -> int:
         if car is None:
             return 1
         client.set_timeout(CALL_TIMEOUT_S)
-        clock, called_ns = MachineClock(), 0
-
-        def answer() -> None:
-            nonlocal called_ns
-            if (now_ns := clock.now().mono_ns) - called_ns >= CALL_NS:
-                client.get_server_version()
-                called_ns = now_ns
-            with suppress(OSError):
-                os.write(sys.stdout.fileno(), BEAT)
-
         os.write(sys.stdout.fileno(), READY)
+        answer = BeatAnswer(client.get_server_version, MachineClock(), sys.stdout.fileno())
         guard(sys.stdin.fileno(), CarBrake(carla, car), answer)
     except (LavtError, RuntimeError):  # the server is gone, and with it the car
         return 1
