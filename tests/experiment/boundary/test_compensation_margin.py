@@ -93,12 +93,13 @@ def config(kind: str, *changes: str) -> RunConfig:
     return load_config(RunConfig, shipped("configs/demo.yaml"), ["time=virtual", *settings, *changes])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("kind", "changes"),
     [
         ("predictive", ("controller.wheelbase_m=4.4", "network.control.delay_ms=100")),
-        pytest.param("constant_delay", (), marks=pytest.mark.full),
-        pytest.param("smith", ("controller.wheelbase_m=5.5",), marks=pytest.mark.full),
+        ("constant_delay", ()),
+        ("smith", ("controller.wheelbase_m=5.5",)),
     ],
 )
 def test_the_whole_loop_becomes_unstable_where_the_model_does(kind: str, changes: tuple[str, ...]) -> None:
