@@ -111,7 +111,7 @@ def test_addresses() -> None:
 
 
 def test_configured_lags_replace_those_of_the_car() -> None:
-    """Configured dead times and lags replace the car's own, and other parameters stay unchanged."""
+    """Configured dead times, lags and stiffness replace the car's own, and other parameters stay unchanged."""
     assert car_of(VehicleConfig()) == LINCOLN_MKZ
     config = VehicleConfig(
         steering_dead_time_ms=240.0,
@@ -119,6 +119,7 @@ def test_configured_lags_replace_those_of_the_car() -> None:
         pedal_dead_time_ms=100.0,
         throttle_lag_ms=0.0,
         brake_lag_ms=50.0,
+        front_stiffness_nprad=116_621.0,
     )
     assert car_of(config) == replace(
         LINCOLN_MKZ,
@@ -127,6 +128,7 @@ def test_configured_lags_replace_those_of_the_car() -> None:
         pedal_dead_time_s=0.1,
         throttle_lag_s=0.0,
         brake_lag_s=0.05,
+        front_stiffness_nprad=116_621.0,
     )
 
 

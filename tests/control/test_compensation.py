@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 
+from lavt.config import CompensationConfig
 from lavt.control.compensation import (
     VARIANTS,
     CompensatingController,
@@ -228,3 +229,12 @@ def test_a_schedule_is_linear_between_its_points() -> None:
 def test_every_variant_is_a_controller_by_name(kind: str) -> None:
     """Each kind of the table can be made by its name."""
     assert isinstance(make_controller(kind, PRESET, LINCOLN_MKZ.wheelbase_m), CompensatingController)
+
+
+def test_the_age_of_the_average_follows_the_frame_rate() -> None:
+    """Unless it is configured, the age of the averaged lane is two thirds of the time between pictures."""
+    config = CompensationConfig()
+    ages_s = [config.settings_at(rate_hz).average_lag_s for rate_hz in (10.0, 15.0, 30.0)]
+    assert ages_s == [0.067, 0.044, CompensationSettings().average_lag_s]
+    assert CompensationConfig(average_lag_s=0.01).settings_at(10.0).average_lag_s == 0.01
+    assert config.changes == {}

@@ -15,7 +15,7 @@ from lavt.assembly.security import build_cipher
 from lavt.assembly.vehicles import VehicleSetup, check_vehicle, physics_sample_times
 from lavt.config import HUMAN, ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.client_limits import CLIENT_LIMITS
-from lavt.control.compensation import VARIANTS, CompensatingController, CompensationSettings
+from lavt.control.compensation import VARIANTS, CompensatingController
 from lavt.control.drive_controller import DriveController, make_controller
 from lavt.control.human_controls import HUMAN_LIMITS, HumanControls
 from lavt.control.prediction import CarModel
@@ -93,8 +93,8 @@ def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
         build_controller(controller)
 
 
-def build_controller(config: ControllerConfig, seed: int = 1) -> DriveController:
-    """Build the configured controller; the noise of the human model depends on `seed`.
+def build_controller(config: ControllerConfig, seed: int = 1, *, rate_hz: float = 30.0) -> DriveController:
+    """Build the configured controller, for pictures at `rate_hz`; the noise of the human model depends on `seed`.
 
     Raises `UserError` with the known names for an unknown controller or preset.
     """
@@ -107,7 +107,7 @@ def build_controller(config: ControllerConfig, seed: int = 1) -> DriveController
         variant, preset = VARIANTS[config.kind], config.effective_preset()
         if config.lookahead_s is None:
             preset = replace(preset, lookahead_s=variant.lookahead_s)
-        known = CompensationSettings(**config.compensation.model_dump())
+        known = config.compensation.settings_at(rate_hz)
         return CompensatingController(variant, preset, wheelbase_m=config.wheelbase_m, settings=known)
     return make_controller(config.kind, config.effective_preset(), config.wheelbase_m)
 
@@ -291,7 +291,7 @@ def _page_watch(config: ClientConfig, instance: int) -> PageWatchNode:
 def _driver(config: ClientConfig, fidelity: FidelityModel) -> Callable[[ClientSession], DriverNode]:
     """Prepare a driver node with the configured controller; return a function that builds it for a session."""
     reader, detector = PictureReader(fidelity.receiver(config)), fidelity.detector(config)
-    controller = build_controller(config.controller, config.seed)
+    controller = build_controller(config.controller, config.seed, rate_hz=config.camera.rate_hz)
     lane_confidence = config.controller.effective_preset().lane_confidence
     return lambda session: DriverNode(
         reader, detector, controller, session, CLIENT_LIMITS, lane_confidence=lane_confidence

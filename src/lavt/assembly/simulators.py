@@ -19,7 +19,10 @@ GENERATIONS: Final[dict[str, Literal[1, 2]]] = {"dataspeed_1": 1, "dataspeed_2":
 
 
 def car_of(config: VehicleConfig) -> CarParameters:
-    """Return the configured car with the configured lags; raise `UserError` with the known names for an unknown car."""
+    """Return the configured car with the configured lags and stiffness.
+
+    Raises `UserError` with the known names for an unknown car.
+    """
     lags_ms = {
         "steering_dead_time_s": config.steering_dead_time_ms,
         "steering_lag_s": config.steering_lag_ms,
@@ -28,7 +31,9 @@ def car_of(config: VehicleConfig) -> CarParameters:
         "brake_lag_s": config.brake_lag_ms,
     }
     lags_s = {name: lag_ms / 1000 for name, lag_ms in lags_ms.items() if lag_ms is not None}
-    return replace(named_car(config.car), **lags_s)
+    car = replace(named_car(config.car), **lags_s)
+    stiffness_nprad = config.front_stiffness_nprad
+    return car if stiffness_nprad is None else replace(car, front_stiffness_nprad=stiffness_nprad)
 
 
 def simulator_of(config: ServerConfig, road: Road, start_ns: int) -> Simulator:
@@ -40,6 +45,7 @@ def simulator_of(config: ServerConfig, road: Road, start_ns: int) -> Simulator:
         parameters=car_of(config.vehicle),
         continue_after_collision=config.vehicle.after_collision == "continue",
         limit_s=config.vehicle.time_limit_s,
+        speed_report_factor=config.vehicle.speed_report_factor,
     )
 
 

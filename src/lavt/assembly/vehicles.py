@@ -30,7 +30,7 @@ from lavt.vehicle.carla.settings import CarlaSettings
 from lavt.vehicle.carla.ticker import Ticker
 from lavt.vehicle.carla.vehicle import CarlaVehicle
 from lavt.vehicle.sim.rendering.camera import SimCamera
-from lavt.vehicle.sim.rendering.lane_camera import LaneCamera
+from lavt.vehicle.sim.rendering.lane_camera import LaneCamera, LaneNoise
 from lavt.vehicle.sim.road.road import Road, load_road
 from lavt.vehicle.sim.simulator import start_offset
 from lavt.vehicle.vehicle import Vehicle
@@ -216,8 +216,17 @@ def build_geometry_setup(config: ServerConfig) -> VehicleSetup:
         half_width_m=GRID.half_width_m,
         exposure_ns=round(config.camera.exposure_ms * NS_PER_MS),
         sensor_delay_ns=round(config.camera.sensor_delay_ms * NS_PER_MS),
+        noise=lane_noise(config),
     )
     return _build_simulated(config, road, camera)
+
+
+def lane_noise(config: ServerConfig) -> LaneNoise | None:
+    """Return the configured noise of the seen lane; None without any."""
+    vehicle = config.vehicle
+    if not vehicle.lane_noise_m and not vehicle.lane_noise_rad:
+        return None
+    return LaneNoise(config.seed, vehicle.lane_noise_m, vehicle.lane_noise_rad)
 
 
 def camera_phase_ns(config: ServerConfig) -> int:

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from lavt.config.section import Section
 from lavt.config.vehicle import MAX_SIMULATED_MPS
-from lavt.control.compensation import VARIANTS, CompensationSettings
+from lavt.control.compensation import VARIANTS, CompensationSettings, average_lag_s
 from lavt.control.preset import Preset, find_preset
 from lavt.control.two_point import TWO_POINT, TwoPointSettings
 
@@ -87,8 +87,9 @@ class CompensationConfig(Section):
     """The largest rate of the wheels' angle; by default the built-in car's."""
     camera_delay_s: float = Field(_COMPENSATION.camera_delay_s, ge=0, le=1)
     """Time from the exposure of a picture to its stamp; by default the built-in camera's."""
-    average_lag_s: float = Field(_COMPENSATION.average_lag_s, ge=0, le=1)
-    """By how much the lane detector's moving average makes the lane older; by default at 30 Hz."""
+    average_lag_s: float | None = Field(None, ge=0, le=1)
+    """By how much the lane detector's moving average makes the lane older; null: two thirds of the time between
+    pictures, to 1 ms."""
     delay_error_s: float = Field(_COMPENSATION.delay_error_s, ge=-1, le=1)
     """Added to the measured delay, to show what a wrong estimate costs."""
     constant_delay_s: float = Field(_COMPENSATION.constant_delay_s, ge=0, le=3)
@@ -97,7 +98,13 @@ class CompensationConfig(Section):
     @property
     def changes(self) -> dict[str, Any]:
         """Settings that differ from the defaults."""
-        return {name: value for name, value in self.model_dump().items() if value != getattr(_COMPENSATION, name)}
+        known = {name: value for name, value in self.model_dump().items() if value is not None}
+        return {name: value for name, value in known.items() if value != getattr(_COMPENSATION, name)}
+
+    def settings_at(self, rate_hz: float) -> CompensationSettings:
+        """Return what the controller knows of a car and of a camera with this frame rate."""
+        known = {name: value for name, value in self.model_dump().items() if value is not None}
+        return CompensationSettings(**{"average_lag_s": average_lag_s(rate_hz), **known})
 
 
 class ControllerConfig(Section):

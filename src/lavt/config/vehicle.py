@@ -41,6 +41,17 @@ class VehicleConfig(Section):
     """The time constant with which the throttle follows."""
     brake_lag_ms: float | None = Field(None, ge=0, le=5000)
     """The time constant with which the brake follows."""
+    front_stiffness_nprad: float | None = Field(None, ge=50_000, le=500_000)
+    """The side force of the front axle per radian of slip; a smaller value makes the car understeer more. Null: the
+    value of `car`."""
+    speed_report_factor: float = Field(1.0, ge=0.5, le=2)
+    """The reported speed divided by the true speed, as with tyres of another size. The vehicle's own safety limits use
+    the reported speed, too."""
+    lane_noise_m: float = Field(0.0, ge=0, le=1)
+    """For fidelity `geometry`: standard deviation of the noise of the seen lane's lateral position, independent between
+    frames."""
+    lane_noise_rad: float = Field(0.0, ge=0, le=0.2)
+    """The same for the direction of the lane at the rear axle."""
     after_collision: Literal["end", "continue"] = "end"
     """Whether a collision ends the drive, or the car slides along the obstacle and continues."""
     time_limit_s: float | None = Field(None, gt=0, le=86_400)

@@ -104,6 +104,14 @@ class CompensationSettings:
     """The total delay, from the exposure, that a controller assumes which does not measure it."""
 
 
+def average_lag_s(rate_hz: float) -> float:
+    """Return the age that the detector's moving average adds to a lane at a frame rate, to 1 ms.
+
+    To first order, an average with the weight w = 0.6 for the newest lane is the lane (1 - w) / w frame periods before.
+    """
+    return round(2 / 3 / rate_hz, 3)
+
+
 class CompensatingController:
     """A lane keeper that knows the delay of its loop, and does what its variant says.
 

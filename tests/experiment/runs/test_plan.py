@@ -122,6 +122,7 @@ BAD_SWEEPS: list[tuple[dict[str, Any], str]] = [
     ({"axes": {"controller.preset": ["designed", "magic"]}}, "'magic'; choose one of"),
     ({"axes": {"controller.kind": ["wizard"]}}, "'wizard'; choose one of"),
     ({"axes": {"vehicle.kind": ["boat"]}}, "'boat'"),
+    ({"fidelity": "pixels", "vehicle": {"lane_noise_m": 0.1}}, "choose fidelity geometry"),
 ]
 
 

@@ -270,3 +270,15 @@ def test_a_car_that_hits_the_end_of_a_rail_stops_before_it() -> None:
     assert max(steps_m) < 0.06
     assert simulator.state().speed_mps < 0.3
     assert simulator.ground_truth().progress_m < 20.0 - 3.6, "the front is 3.89 m ahead of the rear axle"
+
+
+def test_the_reported_speed_can_be_wrong(road: Road) -> None:
+    """A factor changes the reported speed only: the car drives as without it, and the ground truth is true."""
+    exact = simulator_on(road)
+    wrong = Simulator(road=road, seed=1, start_mono_ns=START_NS, speed_report_factor=1.25)
+    for simulator in (exact, wrong):
+        simulator.apply(GO, START_NS)
+        simulator.advance(START_NS + 2 * NS_PER_S)
+    assert wrong.ground_truth() == exact.ground_truth()
+    assert exact.state().speed_mps == exact.ground_truth().speed_mps > 1.0
+    assert wrong.state().speed_mps == 1.25 * exact.state().speed_mps

@@ -60,6 +60,11 @@ def plan_run(
             "fidelity geometry has no pictures for a detector: leave out perception.detector, or choose fidelity "
             "pixels or video"
         )
+    if config.fidelity != "geometry" and (config.vehicle.lane_noise_m or config.vehicle.lane_noise_rad):
+        raise UserError(
+            "vehicle.lane_noise_m and vehicle.lane_noise_rad are noise of a lane without pictures: leave them out, or "
+            "choose fidelity geometry"
+        )
     _check_injection(config, requested)
     is_unimpaired = config.network.inherent == "loopback" and requested == NO_CONDITION
     if config.time == "real" and config.network.injection == "none" and not is_unimpaired:

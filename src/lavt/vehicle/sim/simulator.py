@@ -42,7 +42,8 @@ class Simulator:
 
     Physics is lazy: `advance` makes all steps since its last call, however late it is called. The steps lie on a grid
     of 1/240 s of the monotonic clock, and begin at the first grid point at or after `start_mono_ns`. After a collision
-    the car stays where it is or, with `continue_after_collision`, slides along the obstacle.
+    the car stays where it is or, with `continue_after_collision`, slides along the obstacle. The speed in `state` is
+    the true one times `speed_report_factor`.
     """
 
     def __init__(
@@ -54,7 +55,9 @@ class Simulator:
         parameters: CarParameters = LINCOLN_MKZ,
         continue_after_collision: bool = False,
         limit_s: float | None = None,
+        speed_report_factor: float = 1.0,
     ) -> None:
+        self._speed_report_factor = speed_report_factor
         self._parameters, self._continues_after_collision = parameters, continue_after_collision
         self._steering_dead_ns = round(parameters.steering_dead_time_s * NS_PER_S)
         self._pedal_dead_ns = round(parameters.pedal_dead_time_s * NS_PER_S)
@@ -143,10 +146,11 @@ class Simulator:
             self._actuation = Actuation(steering_rad, throttle, brake)
 
     def state(self) -> VehicleState:
-        """Return speed and road wheel angle at the newest grid point."""
+        """Return reported speed and road wheel angle at the newest grid point."""
         if self._state is None:
             motion = self._car.motion
-            self._state = VehicleState(grid_ns(self._index), motion.speed_mps, motion.steering_rad, "drive")
+            reported_mps = motion.speed_mps * self._speed_report_factor
+            self._state = VehicleState(grid_ns(self._index), reported_mps, motion.steering_rad, "drive")
         return self._state
 
     def ground_truth(self) -> GroundTruth:

@@ -1,19 +1,20 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
 from lavt.domain import CameraModel, Lane, Pose
-from lavt.vehicle.sim.rendering.lane_camera import LaneCamera
+from lavt.vehicle.sim.rendering.lane_camera import LaneCamera, LaneNoise
 from lavt.vehicle.sim.road.road import Road, load_road, parse_road
 
 ROAD = load_road("a_key")
 S_M = 5.0
 
 
-def camera(*, model: CameraModel = CameraModel(), road: Road = ROAD, **keys: int) -> LaneCamera:  # noqa: B008 (frozen)
+def camera(*, model: CameraModel = CameraModel(), road: Road = ROAD, **keys: Any) -> LaneCamera:  # noqa: B008 (frozen)
     return LaneCamera(
         model=model, rate_hz=30.0, phase_ns=0, road=road, near_m=3.6, far_m=20.0, half_width_m=7.0, **keys
     )
@@ -105,3 +106,15 @@ def test_the_width_of_the_lane_is_that_at_the_car() -> None:
     lane_camera = camera(road=road)
     widths_m = [lane_camera.observe_lane(pose_at(s_m, road=road)).width_m for s_m in range(10, 71, 10)]
     assert widths_m == pytest.approx([3.5, 3.5, 3.25, 3.0, 2.75, 2.5, 2.5])
+
+
+def test_the_noise_of_a_lane_depends_on_seed_and_frame_only() -> None:
+    """Position and direction of a lane have noise of the given deviations, which is equal for equal frame numbers."""
+    exact = camera().observe_lane(pose_at(S_M)).centre
+    noise = LaneNoise(3, 0.1, 0.01)
+    noisy = camera(noise=noise)
+    frames = [noisy.capture(number, 0, pose_at(S_M)) for number in (*range(400), 7)]
+    errors = np.array([frame.picture.lane.centre for frame in frames if frame]) - exact
+    assert errors[7].tolist() == errors[-1].tolist()
+    np.testing.assert_allclose(errors[:400].std(axis=0), [0.1, 0.01, 0.0], rtol=0.15)
+    np.testing.assert_allclose(errors[:400].mean(axis=0), 0.0, atol=0.02)

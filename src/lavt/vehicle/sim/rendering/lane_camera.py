@@ -6,8 +6,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec.structs import replace
 
 from lavt.domain import CameraModel, Lane, Pose, SeenLane
+from lavt.streams import IndexedStream
 from lavt.vehicle.camera import CapturedFrame, newest_pose
 from lavt.vehicle.sim.road.road import Road
 
@@ -25,13 +27,30 @@ STATION_SPACING_M = 1.0
 """The spacing of the sampled points on the lane's lines."""
 
 
+class LaneNoise:
+    """Normally distributed noise of a lane's lateral position and direction at the rear axle.
+
+    It is independent between frames. That of a frame depends only on the seed and on the frame's number.
+    """
+
+    def __init__(self, seed: int, position_m: float, direction_rad: float) -> None:
+        self._deviations = (position_m, direction_rad)
+        self._stream = IndexedStream(seed, "lane noise")
+
+    def added_to(self, lane: Lane, number: int) -> Lane:
+        """Return the lane of a frame with its noise."""
+        moved_m, turned_rad = (self._stream.at(number).standard_normal(2) * self._deviations).tolist()
+        c0, c1, c2 = lane.centre
+        return replace(lane, centre=(c0 + moved_m, c1 + turned_rad, c2))
+
+
 class LaneCamera:
     """A `lavt.vehicle.camera.Camera` without pixels: its pictures are `SeenLane`, fitted to the road's true centre.
 
     The lane is visible on the detector's ground: between `near_m` and `far_m` ahead of the rear axle, up to
     `half_width_m` to both sides, and in the camera's field of view. The camera's position, yaw and horizontal angle
     matter; pitch and roll do not. Confidence is the share of the lane's two lines that is visible. A car that is turned
-    by more than 90 degrees sees no lane.
+    by more than 90 degrees sees no lane. With `noise`, the captured lanes are not exact.
     """
 
     def __init__(
@@ -46,12 +65,14 @@ class LaneCamera:
         half_width_m: float,
         exposure_ns: int = 0,
         sensor_delay_ns: int = 0,
+        noise: LaneNoise | None = None,
     ) -> None:
         self.model = model
         self.rate_hz = rate_hz
         self.phase_ns = phase_ns
         self.exposure_ns = exposure_ns
         self.sensor_delay_ns = sensor_delay_ns
+        self._noise = noise
         self._road = road
         self._near_m, self._far_m, self._half_width_m = near_m, far_m, half_width_m
         half_rad = model.field_of_view_rad / 2
@@ -72,7 +93,10 @@ class LaneCamera:
         """Return the lane visible from `pose`; None without a pose."""
         if pose is None:
             return None
-        return CapturedFrame(number, at_ns, SeenLane(0, at_ns, self.observe_lane(pose)))
+        lane = self.observe_lane(pose)
+        if self._noise is not None:
+            lane = self._noise.added_to(lane, number)
+        return CapturedFrame(number, at_ns, SeenLane(0, at_ns, lane))
 
     def capture_after_exposure(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
         """Return the lane visible from the middle between the poses when the shutter opens and when it closes."""
