@@ -74,6 +74,8 @@ NEW_CONDITION_KEYS = (
     "collisions_per_km",
     "lane_invasions_per_km",
     "heading_rms_rad",
+    "lateral_jerk_rms_mps3",
+    "steering_rate_rms_radps",
     "steering_reversals_per_s",
     "oscillation_hz",
     "mae_m",

@@ -64,7 +64,8 @@ def test_a_condition_without_valid_runs_is_null() -> None:
 def test_real_and_virtual_runs_are_never_mixed() -> None:
     """Runs in real time are under `real`, runs in virtual time under `conditions`, and all under `runs`."""
     summary = summarize([run(), run(time="real", condition="L5")], SPEED)
-    assert set(summary) == {"schema", "speed", "runs", "failed", "conditions", "contrasts", "real", "groups", "paper"}
+    keys = {"schema", "speed", "runs", "failed", "conditions", "contrasts", "real", "groups", "controllers", "paper"}
+    assert set(summary) == keys
     assert set(summary["conditions"]) == {"L0"}
     assert set(summary["real"]) == {"L5"}
     assert len(summary["runs"]) == 2

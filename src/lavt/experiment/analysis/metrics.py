@@ -10,6 +10,7 @@ import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.analysis.clocks import RunClocks, run_clocks
+from lavt.experiment.analysis.comfort import comfort_metrics
 from lavt.experiment.analysis.lane_kept import completed_in_own_lane, lane_kept
 from lavt.experiment.analysis.latency import (
     ages_at_actuation_ns,
@@ -108,6 +109,7 @@ def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
         "p95_by_10m": p95_by_10m(truth),
         **heading_metrics(truth),
         **steering_metrics(truth),
+        **comfort_metrics(truth),
         "collisions": collisions,
         "lane_invasions": invasions,
         "collisions_per_km": per_km(collisions, driven_m),

@@ -31,6 +31,9 @@ ALL_RUNS_P95 = "p95 m of all runs up to their end"
 FOLLOWED_P95 = "p95 m against the lane followed, of the runs that completed"
 COMMON_P95 = "p95 m, up to common distance"
 
+JERK = "lateral jerk m/s³, rms"
+STEERING_RATE = "steering rate rad/s, rms"
+
 ENDED_EARLY = "ended early"
 """The text of a quantile over all runs if the run with this rank was not completed."""
 
@@ -144,6 +147,8 @@ def error_table(conditions: Conditions, paper: Conditions) -> TableData:
             (extra(number_column("rms m, mean of runs", 2)), "rms_m"),
             (number_column("maximum m, mean of runs", 2), "max_m"),
             (extra(number_column("heading rms rad", 3)), "heading_rms_rad"),
+            (number_column(f"{JERK}, mean of runs", 2), "lateral_jerk_rms_mps3"),
+            (number_column(f"{STEERING_RATE}, mean of runs", 3), "steering_rate_rms_radps"),
             (extra(number_column("steering reversals / s", 2)), "steering_reversals_per_s"),
             (extra(number_column("oscillation Hz", 2)), "oscillation_hz"),
         ],

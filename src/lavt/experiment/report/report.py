@@ -19,6 +19,7 @@ from lavt.experiment.report.condition_sections import (
     error_table_parts,
     latency_table_parts,
 )
+from lavt.experiment.report.controller_section import controller_parts
 from lavt.experiment.report.figures.figure_style import SETTINGS, condition_colours
 from lavt.experiment.report.first_screen import VALIDITY, first_parts
 from lavt.experiment.report.replay_section import replay_parts
@@ -117,6 +118,7 @@ def _chapters(
         ("Driving performance over latency", degradation_parts(report)),
         ("Distance driven and endings", survival_parts(report)),
         ("Maximum tolerable latency", boundary_parts(boundaries, report.directory)),
+        ("Comparison of the controllers", controller_parts(report)),
         ("Comparison of presets and settings", group_parts(report)),
         ("Axes of the sweep", axis_parts(report)),
         ("Results by route", route_parts(report)),

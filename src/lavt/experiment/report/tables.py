@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lavt.experiment.analysis.stage_latency import AFTER_LOOP
-from lavt.experiment.report.condition_tables import COMMON_P95, COMPLETED_P95
+from lavt.experiment.report.condition_tables import COMMON_P95, COMPLETED_P95, JERK, STEERING_RATE
 from lavt.experiment.report.figures.figure_style import Conditions
 from lavt.experiment.report.groups import Group, short_name
 from lavt.experiment.report.table_format import (
@@ -83,6 +83,8 @@ def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
             (extra(number_column("lane invasions / run", 2)), "lane_invasions_per_run"),
             (number_column(f"{COMPLETED_P95}, mean of runs", 2), "p95_m"),
             (extra(number_column(f"{COMMON_P95}, mean of runs", 2)), "p95_common_m"),
+            (number_column(f"{JERK}, mean of runs", 2), "lateral_jerk_rms_mps3"),
+            (number_column(f"{STEERING_RATE}, mean of runs", 3), "steering_rate_rms_radps"),
             (number_column("loop latency ms, median"), "loop_ms.p50"),
             (number_column("frame age, mean ms", 0), "picture_age_ms.mean"),
         ],
@@ -193,6 +195,8 @@ def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
             (extra(share_column("time in own lane")), "lane_kept.own_lane_share"),
             (number_column("p95 error m", 2), "p95_m"),
             (extra(number_column("p95 error against the lane followed m", 2)), "followed_p95_m"),
+            (number_column(JERK, 2), "lateral_jerk_rms_mps3"),
+            (number_column(STEERING_RATE, 3), "steering_rate_rms_radps"),
             (extra(number_column("frame age, mean ms", 0)), "picture_age_ms.mean"),
             (text_column("validity", is_long=True), "validity"),
         ],

@@ -24,6 +24,8 @@ MEANS = (
     "rms_m",
     "max_m",
     "heading_rms_rad",
+    "lateral_jerk_rms_mps3",
+    "steering_rate_rms_radps",
     "steering_reversals_per_s",
     "oscillation_hz",
 )

@@ -8,6 +8,7 @@ from typing import Any
 
 from lavt.experiment.statistics.conditions import Run, summarize_conditions
 from lavt.experiment.statistics.contrasts import paired_contrasts
+from lavt.experiment.statistics.controllers import compare_controllers
 from lavt.experiment.statistics.paper_results import paper
 
 SCHEMA = 2
@@ -46,6 +47,7 @@ def summarize(
         "contrasts": paired_contrasts(base_runs),
         "real": summarize_conditions(run for run in runs if run["time"] == "real"),
         "groups": _summarize_groups(virtual),
+        "controllers": compare_controllers(runs),
         "paper": paper(),
     }
 
