@@ -101,7 +101,7 @@ def test_the_paper_config() -> None:
     ("name", "count"),
     [
         ("compensation.yaml", 1080),
-        ("compensation_mismatch.yaml", 252),
+        ("compensation_mismatch.yaml", 168),
         ("loss_and_jitter.yaml", 36),
         ("roads.yaml", 180),
         ("speed.yaml", 72),
