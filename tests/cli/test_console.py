@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import ast
 import errno
+import io
 import re
 import signal
 import subprocess
@@ -112,6 +113,18 @@ def test_an_error_of_the_system_comes_with_advice(capsys: pytest.CaptureFixture[
     assert exit_error.value.code == 1
     assert str(tmp_path) in message
     assert "free space" in message
+
+
+def test_a_result_that_cannot_be_printed_names_the_standard_output(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the standard output is redirected to a full disk, the error says that it was the standard output."""
+
+    class FullDisk(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(errno.ENOSPC, f"No space left on device for {len(text)} characters")
+
+    monkeypatch.setattr(sys, "stdout", FullDisk())
+    with pytest.raises(OSError, match="the standard output"):
+        console.print_json([1])
 
 
 def messages(call: ast.Call) -> str:

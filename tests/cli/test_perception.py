@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -105,6 +106,14 @@ def test_the_rows_are_printed_as_json(show: Show, capsys: pytest.CaptureFixture[
     assert [row["source"] for row in rows] == ["road.png"] * 2
     assert all(row["confidence"] == 0 and row["followed"] is False and row["width_m"] is None for row in rows)
     assert {path.name for path in Path().iterdir()} == {"camera.yaml", "road.png"}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full: /dev/full")
+def test_a_full_disk_is_named_with_the_table(show: Show) -> None:
+    """If the disk of the CSV file is full, the error names this file."""
+    with pytest.raises(OSError, match="/dev/full") as raised:
+        show("road.png", "--no-draw", "--csv", "/dev/full")
+    assert raised.value.errno == errno.ENOSPC
 
 
 @pytest.mark.parametrize(("lane_confidence", "followed"), [("0.9", True), ("0.95", False)])

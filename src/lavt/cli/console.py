@@ -17,6 +17,7 @@ import typer
 
 from lavt.errors import LavtError, UserError, WorkError
 from lavt.operating_system import HANGUP
+from lavt.recording.output_directory import disk_errors_named
 from lavt.runtime.output import queue_output
 
 BrowserOption = Annotated[
@@ -35,8 +36,8 @@ SetOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 OS_REMEDIES = {
-    errno.ENOSPC: "free space on the disk, or name another one with --out",
-    errno.EDQUOT: "free space in your quota, or name another disk with --out",
+    errno.ENOSPC: "free space on the disk, or write to another one",
+    errno.EDQUOT: "free space in your quota, or write to another disk",
     errno.EACCES: "get the permission, or name another place",
     errno.EPERM: "get the permission, or name another place",
     errno.EROFS: "name a place that can be written",
@@ -54,8 +55,9 @@ def print_message(text: str) -> None:
 
 
 def print_result(text: str) -> None:
-    """Print a result to standard output."""
-    print(f"{text}\n", end="", flush=True)
+    """Print a result to standard output; an error of the disk to which it is redirected names it."""
+    with disk_errors_named("the standard output"):
+        print(f"{text}\n", end="", flush=True)
 
 
 def print_report(page: Path, content: Path, failed: Sequence[tuple[str, str]], *, as_json: bool) -> None:

@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, repeat
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Any
@@ -26,6 +26,7 @@ from lavt.perception.calibration import CalibratedCamera
 from lavt.perception.detection import LANE_WIDTH_M, TRACK_CONFIDENCE, DetectorSettings, PictureDetector
 from lavt.perception.lane_detector import LaneDetector
 from lavt.perception.panel import TILE_PX, draw_panel
+from lavt.recording.output_directory import disk_errors_named
 from lavt.transport.video.stamp import has_stamp
 from lavt.transport.video.video_file import write_video
 
@@ -49,6 +50,25 @@ COLUMNS = (
 )
 """The columns of a row; docs/perception.md explains them."""
 
+SourcesArgument = Annotated[
+    list[Path], typer.Argument(help="PNG, JPEG, MP4, MKV, a run's client.mcap, or directories of such files.")
+]
+StepsOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="For one source the output file: .png or .jpg for a picture, .mp4, .mkv or .webp for a video; "
+        "default: NAME-steps. For several sources or a directory, the output directory; default: perception-steps."
+    ),
+]
+TileWidthOption = Annotated[
+    int, typer.Option(min=200, max=1920, help="The width of each drawn step; its height is three quarters of it.")
+]
+LaneWidthOption = Annotated[
+    float, typer.Option(min=2.0, max=5.0, help="The assumed lane width if only one marking is visible.")
+]
+LaneConfidenceOption = Annotated[
+    float, typer.Option(min=0.05, max=0.95, help="The lowest confidence of a lane that counts as followed.")
+]
 Row = dict[str, Any]
 
 
@@ -132,30 +152,16 @@ def _callback() -> None:
 
 
 def show(
-    sources: Annotated[
-        list[Path], typer.Argument(help="PNG, JPEG, MP4, MKV, a run's client.mcap, or directories of such files.")
-    ],
+    sources: SourcesArgument,
     camera: Annotated[Path, typer.Option(help="A calibration in YAML, or a config with a camera section.")],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="For one source the output file: .png or .jpg for a picture, .mp4, .mkv or .webp for a video; "
-            "default: NAME-steps. For several sources or a directory, the output directory; default: perception-steps."
-        ),
-    ] = None,
+    out: StepsOption = None,
     csv_file: Annotated[
         Path | None, typer.Option("--csv", help="File for a table with one row for each picture.")
     ] = None,
     draw: Annotated[bool, typer.Option("--draw/--no-draw", help="Draw the steps.")] = True,
-    tile_width_px: Annotated[
-        int, typer.Option(min=200, max=1920, help="The width of each drawn step; its height is three quarters of it.")
-    ] = TILE_PX[0],
-    lane_width_m: Annotated[
-        float, typer.Option(min=2.0, max=5.0, help="The assumed lane width if only one marking is visible.")
-    ] = LANE_WIDTH_M,
-    lane_confidence: Annotated[
-        float, typer.Option(min=0.05, max=0.95, help="The lowest confidence of a lane that counts as followed.")
-    ] = LANE_CONFIDENCE,
+    tile_width_px: TileWidthOption = TILE_PX[0],
+    lane_width_m: LaneWidthOption = LANE_WIDTH_M,
+    lane_confidence: LaneConfidenceOption = LANE_CONFIDENCE,
     detector: Annotated[str, typer.Option(help="built_in, onnx, or the name of your own detector.")] = BUILT_IN,
     detector_file: Annotated[Path | None, typer.Option(help="The file with the detector's own settings.")] = None,
     as_json: console.JsonOption = False,
@@ -181,24 +187,17 @@ def show(
     if csv_file is not None and not csv_file.parent.is_dir():
         raise UserError(f"{csv_file.parent} is not a directory: create it, or name another file with --csv")
     files = find_sources(sources)
-    is_single = len(sources) == 1 and not sources[0].is_dir()
-    outputs: list[Path] = []
-    if draw and not is_single:
-        out = out or DIRECTORY
-        if out.is_file():
-            raise UserError(f"{out} is a file, but several files are drawn: name a directory with --out")
-        out.mkdir(parents=True, exist_ok=True)
+    drawn: Iterator[Path | None] = repeat(None)
     with console.interruptible():
-        for file in files:
-            if not draw:
+        if draw:
+            is_single = len(sources) == 1 and not sources[0].is_dir()
+            drawn = _draw_all(inspection, files, out, is_single=is_single)
+        else:
+            for file in files:
                 _only_detect(inspection, file)
-                continue
-            outputs.append(_draw(inspection, file, out, outputs, is_single=is_single))
+        for file, target in zip(files, drawn, strict=False):
             if not as_json:
-                console.print_result(_sentence(file, inspection.rows, outputs[-1]))
-    if not as_json and not draw:
-        for file in files:
-            console.print_result(_sentence(file, inspection.rows, None))
+                console.print_result(_sentence(file, inspection.rows, target))
     if csv_file is not None:
         write_rows(csv_file, inspection.rows)
     if as_json:
@@ -210,16 +209,30 @@ def _only_detect(inspection: _Inspection, file: Path) -> None:
         pass
 
 
-def _draw(inspection: _Inspection, file: Path, out: Path | None, used: Sequence[Path], *, is_single: bool) -> Path:
-    """Draw the steps of a file, and return the output file."""
+def _draw_all(inspection: _Inspection, files: Sequence[Path], out: Path | None, *, is_single: bool) -> Iterator[Path]:
+    """Draw the steps of each file, a single one into a file and several into a directory; yield the outputs."""
+    if is_single:
+        yield _draw(inspection, files[0], out)
+        return
+    directory = out or DIRECTORY
+    if directory.is_file():
+        raise UserError(f"{directory} is a file, but several files are drawn: name a directory with --out")
+    directory.mkdir(parents=True, exist_ok=True)
+    outputs: list[Path] = []
+    for file in files:
+        outputs.append(_draw(inspection, file, directory, outputs))
+        yield outputs[-1]
+
+
+def _draw(inspection: _Inspection, file: Path, out: Path | None, used: Sequence[Path] | None = None) -> Path:
+    """Draw the steps of a file, and return the output: `out`, or with `used` one in `out` that is not in `used`."""
     opened = read_pictures(file)
     suffix = ".mp4" if opened.is_video else ".png"
-    if is_single:
-        target = out or Path(f"{file.stem}-steps{suffix}")
+    names = (f"{file.stem}-steps{suffix}", *(f"{file.stem}-{number}-steps{suffix}" for number in range(2, 10_000)))
+    if out is None:
+        target = Path(names[0])
     else:
-        directory = out or DIRECTORY
-        names = (f"{file.stem}-steps{suffix}", *(f"{file.stem}-{number}-steps{suffix}" for number in range(2, 10_000)))
-        target = next(path for name in names if (path := directory / name) not in used)
+        target = out if used is None else next(path for name in names if (path := out / name) not in used)
     check_output(target, source=file, is_video=opened.is_video)
     panels = inspection.panels(file, opened.pictures)
     if opened.is_video:
@@ -249,7 +262,7 @@ def _sentence(file: Path, rows: Sequence[Row], drawn: Path | None) -> str:
 
 def write_rows(file: Path, rows: Sequence[Row]) -> None:
     """Write the rows as CSV, with a line of names; a value that is not known is empty."""
-    with file.open("w", newline="", encoding="utf-8") as stream:
+    with disk_errors_named(file), file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, COLUMNS)
         writer.writeheader()
         writer.writerows({name: _csv_value(value) for name, value in row.items()} for row in rows)

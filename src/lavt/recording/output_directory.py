@@ -39,13 +39,13 @@ def make_directory(out: Path) -> None:
 
 
 @contextmanager
-def disk_errors_named(directory: Path) -> Iterator[None]:
-    """Add the directory to an error of its disk inside the `with` block; an error of writing itself names no file."""
+def disk_errors_named(output: Path | str) -> Iterator[None]:
+    """Add the output's name to a disk error inside the `with` block; an error of writing itself names no file."""
     try:
         yield
     except OSError as error:
         if error.filename is None and error.errno in DISK_ERRORS:
-            raise OSError(error.errno, error.strerror, str(directory)) from error
+            raise OSError(error.errno, error.strerror, str(output)) from error
         raise
 
 
