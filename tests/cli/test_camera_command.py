@@ -105,11 +105,19 @@ def test_a_calibrated_camera_can_be_mounted_again(calibrate: Calibrate) -> None:
     [
         ((), "name either pictures of a chessboard, or a calibration with --lens"),
         (("boards", "--lens", "lens.yaml"), "name either pictures of a chessboard, or a calibration with --lens"),
-        (("boards", "--corners", "nine"), "'nine': write COLUMNSxROWS"),
+        (("boards", "--corners", "nine", *PLACE), "'nine': write COLUMNSxROWS"),
         (("boards", "--corners", "7x7", *PLACE), "0 pictures show the whole board, 0 of them different, but 3"),
         (("boards",), "give --x-m, and either --z-m or --road"),
-        (("nowhere", *PLACE), "nowhere does not exist"),
+        (("nowhere", *PLACE), "nowhere does not exist: name pictures of a chessboard, or directories of them"),
+        (("empty", *PLACE), "the directory empty has no picture of a chessboard (.png, .jpg, .jpeg): name another"),
         (("--lens", "lens.yaml", "--out", "nowhere/camera.yaml"), "nowhere is not a directory"),
+        (
+            (
+                *("--lens", "lens.yaml", "--road", "road.png", "--left", "1,2", "--right", "3,4", "--distance-m", "3"),
+                *("--check", "nowhere/check.png"),
+            ),
+            "nowhere is not a directory: create it, or name another with --check",
+        ),
         (("--lens", "lens.yaml", "--road", "road.png"), "give --left, --right and --distance-m"),
         (
             ("--lens", "lens.yaml", "--road", "road.png", "--left", "1;2", "--right", "3,4 5,6", "--distance-m", "3.5"),
@@ -134,6 +142,7 @@ def test_a_calibrated_camera_can_be_mounted_again(calibrate: Calibrate) -> None:
 )
 def test_bad_input(calibrate: Calibrate, arguments: tuple[str, ...], reason: str) -> None:
     """Each kind of bad input is rejected with a sentence, and no calibration is written."""
+    Path("empty").mkdir()
     with pytest.raises(UserError) as raised:
         calibrate(*arguments)
     assert reason in str(raised.value)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,10 +18,24 @@ from lavt.transport.video.h264 import Decoder
 from lavt.transport.video.video_file import VIDEO_CODECS
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
-SOURCE_SUFFIXES = (*PICTURE_SUFFIXES, ".mp4", ".mkv", ".avi", ".mov", ".mcap")
-"""The names of files that are read in a directory."""
+VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".mcap")
 DEFAULT_RATE_HZ = 30.0
 """The picture rate of a video whose file states no plausible rate."""
+
+
+class SourceKind(NamedTuple):
+    """The kind of files that a command reads."""
+
+    suffixes: tuple[str, ...]
+    """The names of files that are read in a directory."""
+    singular: str
+    plural: str
+    """The kind in messages."""
+
+
+PICTURES_AND_VIDEOS = SourceKind(
+    (*PICTURE_SUFFIXES, *VIDEO_SUFFIXES), "picture, video or record", "pictures, videos, records"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +47,8 @@ class PictureFile:
     rate_hz: float = DEFAULT_RATE_HZ
 
 
-def find_sources(paths: Sequence[Path]) -> list[Path]:
-    """Return the files, and for each directory the pictures, videos and records in it, sorted by name.
+def find_sources(paths: Sequence[Path], kind: SourceKind = PICTURES_AND_VIDEOS) -> list[Path]:
+    """Return the files, and for each directory the files of that kind in it, sorted by name.
 
     Raises `UserError` if a path does not exist, or if a directory has no such file.
     """
@@ -42,16 +57,16 @@ def find_sources(paths: Sequence[Path]) -> list[Path]:
         if not path.is_dir():
             files.append(path)
             continue
-        found = sorted(file for file in path.iterdir() if file.suffix.lower() in SOURCE_SUFFIXES and file.is_file())
+        found = sorted(file for file in path.iterdir() if file.suffix.lower() in kind.suffixes and file.is_file())
         if not found:
             raise UserError(
-                f"the directory {path} has no picture, video or record ({', '.join(SOURCE_SUFFIXES)}): name another "
-                "directory, or files"
+                f"the directory {path} has no {kind.singular} ({', '.join(kind.suffixes)}): name another directory, or "
+                "files"
             )
         files += found
     missing = [file for file in files if not file.exists()]
     if missing:
-        raise UserError(f"{missing[0]} does not exist: name a picture, a video, a record or a directory of them")
+        raise UserError(f"{missing[0]} does not exist: name {kind.plural}, or directories of them")
     return files
 
 
@@ -104,16 +119,19 @@ def _read_record(path: Path) -> Iterator[Picture]:
         )
 
 
-def check_output(out: Path, *, source: Path, is_video: bool) -> None:
-    """Raise `UserError` if `out` has an unknown suffix, is in a missing directory, or is the source."""
+def check_output(out: Path, *, source: Path, is_video: bool, option: str = "--out") -> None:
+    """Raise `UserError` if `out` has an unknown suffix, is in a missing directory, or is the source.
+
+    The message names the `option` of the command that chooses another output.
+    """
     suffixes = tuple(VIDEO_CODECS) if is_video else PICTURE_SUFFIXES
     if out.suffix.lower() not in suffixes:
         kind = "video" if is_video else "picture"
         raise UserError(f"{out} cannot be written: the name of a {kind} ends with {' or '.join(suffixes)}")
     if not out.parent.is_dir():
-        raise UserError(f"{out.parent} is not a directory: create it, or name another with --out")
+        raise UserError(f"{out.parent} is not a directory: create it, or name another with {option}")
     if out.exists() and out.samefile(source):
-        raise UserError(f"{out} is the input and would be overwritten: name another file with --out")
+        raise UserError(f"{out} is the input and would be overwritten: name another file with {option}")
 
 
 def write_picture(out: Path, picture: Picture) -> None:
