@@ -61,7 +61,7 @@ def test_a_wrong_lane_has_low_confidence(verdicts: VerdictsByKind) -> None:
 
 def test_a_tracked_lane_is_not_led_astray(verdicts: VerdictsByKind) -> None:
     """At most 2 % of tracked pictures have a wrong lane with enough confidence for driving."""
-    tracked = [pair[1] for kind, pairs in verdicts.items() if kind != "kerb only" for pair in pairs]
+    tracked = [pair[1] for kind, pairs in verdicts.items() if kind != UNDECIDED for pair in pairs]
     assert sum(verdict.wrong and verdict.accepted for verdict in tracked) <= 0.02 * len(tracked)
 
 

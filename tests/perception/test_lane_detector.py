@@ -128,6 +128,39 @@ def test_the_lane_is_kept_while_the_car_leaves_it(scene: Scene) -> None:
     assert centre_at(lane, 8.0) == pytest.approx(-3.0, abs=0.3)  # the average lags by 0.2 m
 
 
+@pytest.mark.parametrize(
+    ("shift_m", "heading_rad", "is_tracked"),
+    [(0.3, 0.0, True), (-0.3, 0.0, True), (0.0, 0.04, True), (0.6, 0.0, False), (-0.6, 0.0, False), (0.0, 0.08, False)],
+)
+def test_a_single_line_elsewhere_is_another_line(
+    scene: Scene, shift_m: float, heading_rad: float, *, is_tracked: bool
+) -> None:
+    """If one line vanishes at once and the other one is elsewhere, as a kerb would be, there is no lane any more."""
+    detector = LaneDetector(MODEL)
+    before = detector.detect(scene.render(LANE))
+    picture = scene.render((Line(-1.75 + shift_m),), heading_rad=heading_rad)
+    lane = detector.detect(picture)
+    assert (lane.confidence > 0.4) == is_tracked
+    assert (lane.confidence == 0.0) == (not is_tracked)
+    assert (lane.centre == before.centre) == (not is_tracked)
+    assert (detector.detect(picture).confidence > 0.4) == is_tracked
+
+
+def test_a_line_that_was_alone_before_may_move(scene: Scene) -> None:
+    """A single line that is tracked for longer is tracked over a jump of 0.6 m, as after lost pictures."""
+    detector = LaneDetector(MODEL)
+    for lines in (LANE, LANE[1:], (Line(-2.35),)):
+        lane = detector.detect(scene.render(lines))
+    assert lane.confidence > 0.4
+
+
+def test_two_lines_may_jump(scene: Scene) -> None:
+    """A lane of which both lines are seen is tracked over a jump of 0.6 m, as after lost pictures."""
+    detector = LaneDetector(MODEL)
+    detector.detect(scene.render(LANE))
+    assert detector.detect(scene.render(LANE, offset_m=0.6)).confidence > 0.8
+
+
 @pytest.mark.parametrize("direction", [1, -1])
 def test_a_lane_is_dropped_one_width_away(scene: Scene, direction: int) -> None:
     """When a car reaches the middle of the next lane, the detector changes to that lane."""

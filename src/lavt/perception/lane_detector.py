@@ -13,7 +13,16 @@ from lavt.errors import UserError
 from lavt.perception.bird_eye import GroundGrid, make_bird_eye
 from lavt.perception.calibration import CalibratedCamera, calibrated_pinhole_camera
 from lavt.perception.detection import LANE_WIDTH_M, TRACK_CONFIDENCE, PaintFinder
-from lavt.perception.lane_fit import OUTLIER_M, LaneFit, Points, Sides, fit_lane, mark_points, sides_near
+from lavt.perception.lane_fit import (
+    OUTLIER_M,
+    LaneFit,
+    Points,
+    Sides,
+    evaluate_centre,
+    fit_lane,
+    mark_points,
+    sides_near,
+)
 from lavt.perception.lane_paint import Mask, lane_paint
 from lavt.perception.lane_search import has_parallel, sides_by_windows, start_lanes
 
@@ -39,6 +48,19 @@ In this time a car drives 2.9 m at 30 km/h. If it drives straight and the lane h
 of the car moves sideways by 0.7 m, the tracking range (`CORRIDOR_M` in `lane_fit.py`). After a longer gap another line
 could be at the old position.
 """
+BOTH_SEEN = 0.6
+SINGLE_LINE = 0.2
+"""If both lines were visible over the first share of the range, and in the next picture one of them over less than the
+second share, then a line has vanished at once."""
+SHIFT_M = 0.25
+TURN_RAD = 0.05
+"""When a line vanishes at once, the other one must not have moved and turned by more than this.
+
+A car at 30 km/h that slides aside at 1 m/s and turns at 0.7 rad/s moves it by 0.03 m and turns it by 0.02 rad in a
+thirtieth of a second, and the averaged lane lags by two thirds of that.
+"""
+COMPARED_AT_M = np.array([5.0, 10.0, 15.0])
+"""Distances at which the line is compared."""
 DROP_LANE_AT_WIDTHS = 1.0
 """A lane is dropped when the car is this many lane widths off its centre: the car is then in the middle of the next
 lane."""
@@ -59,7 +81,7 @@ class DetectionTrace:
     windows: tuple[tuple[float, float], ...]
     """The sliding windows of a search, as `sides_by_windows` returns them; empty if the lane was tracked."""
     fit: LaneFit | None
-    """The lane in this picture alone; None if there is none."""
+    """The lane in this picture alone; None if there is none, or none that is believed."""
 
     @property
     def is_search(self) -> bool:
@@ -96,6 +118,8 @@ class LaneDetector:
         self._paint_finder = paint_finder
         self._lane = Lane((0.0, 0.0, 0.0), lane_width_m, grid.near_m, grid.far_m, 0.0)
         self._misses = FORGET_AFTER_PICTURES
+        self._second_line = 0.0
+        """The visible share of the less visible line in the last picture; 0 if no lane was believed in it."""
 
     @property
     def finds_paint_itself(self) -> bool:
@@ -117,9 +141,11 @@ class LaneDetector:
         fit = self.trace.fit
         if fit is None or fit.confidence < self._track_confidence:
             self._misses += 1
+            self._second_line = 0.0
             self._lane = replace(self._lane, confidence=0.0 if fit is None else fit.confidence)
         else:
             self._misses = 0
+            self._second_line = min(fit.left_visible, fit.right_visible)
             self._lane = average_lane(self._lane, fit) if tracked else average_lane(None, fit)
             if car_has_left(self._lane):
                 self.forget()
@@ -141,7 +167,13 @@ class LaneDetector:
     def _track(self, mask: Mask, points: Points) -> DetectionTrace:
         sides = sides_near(points, self._lane.centre, self._lane.width_m)
         fit = fit_lane(points, sides, self.bird_eye.grid, self._lane.width_m, self._lane.centre)
+        if fit is not None and fit.confidence >= self._track_confidence and self._is_another_line(fit):
+            self.forget()
+            fit = None
         return DetectionTrace(mask, points, sides, self._lane.centre, self._lane.width_m, (), fit)
+
+    def _is_another_line(self, fit: LaneFit) -> bool:
+        return self._second_line >= BOTH_SEEN and is_another_line(fit, self._lane.centre)
 
     def _search(self, mask: Mask, points: Points) -> DetectionTrace:
         grid = self.bird_eye.grid
@@ -208,6 +240,17 @@ class GroundTruthLaneDetector:
 def contains_car(lane: LaneFit) -> bool:
     """Return whether the car is in a lane, within a fit's accuracy; a car on a line is in the lanes on both sides."""
     return _lateral_distance_m(lane.centre) <= lane.width_m / 2 + OUTLIER_M
+
+
+def is_another_line(fit: LaneFit, before: tuple[float, float, float]) -> bool:
+    """Return whether a lane has a single line, and that line is not near the last picture's lane, given its centre.
+
+    A kerb within reach of the last line is fitted like a line. A line that stays alone does not jump.
+    """
+    if min(fit.left_visible, fit.right_visible) >= SINGLE_LINE:
+        return False
+    shift_m = np.abs(evaluate_centre(COMPARED_AT_M, fit.centre)[0] - evaluate_centre(COMPARED_AT_M, before)[0])
+    return bool(np.any(shift_m > SHIFT_M + TURN_RAD * COMPARED_AT_M))
 
 
 def car_has_left(lane: Lane) -> bool:
