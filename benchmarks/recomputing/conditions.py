@@ -21,7 +21,16 @@ Values = Callable[[Sequence[Row]], list[float]]
 """The values of a measure in those of the given runs that have one."""
 
 PLANNED = (("L0", "L1"), ("L1", "L2"), ("L2", "L3"), ("L2", "L4"), ("L3", "L4"), ("L3", "L5"))
-MEANS = ("mae_m", "rms_m", "max_m", "heading_rms_rad", "steering_reversals_per_s", "oscillation_hz")
+MEANS = (
+    "mae_m",
+    "rms_m",
+    "max_m",
+    "heading_rms_rad",
+    "lateral_jerk_rms_mps3",
+    "steering_rate_rms_radps",
+    "steering_reversals_per_s",
+    "oscillation_hz",
+)
 COUNTS = ("collisions", "lane_invasions")
 LATENCIES = ("tau_v_ms", "tau_c_ms", "loop_ms", "age_at_actuation_ms")
 PAGE_LATENCIES = ("page_decoded_ms", "page_shown_ms")

@@ -106,6 +106,7 @@ def lane_keeping(truth: list[Row], events: Counter[str]) -> Row:
         "heading_p95_rad": np.percentile(heading_rad, 95),
         "steering_rms_rad": np.sqrt(np.mean(samples(progress_m, steering_rad) ** 2)),
         "steering_rate_rms_radps": np.sqrt(np.sum(changes_rad**2 / steps_s) / np.sum(steps_s)),
+        "lateral_jerk_rms_mps3": lateral_jerk_rms(times_s, truth),
         "steering_reversals_per_s": reversals / times_s[-1],
         "steering_reversals_per_km": reversals / (driven_m / 1000),
         "oscillation_hz": oscillation_hz(times_s, steering_rad),
@@ -115,6 +116,17 @@ def lane_keeping(truth: list[Row], events: Counter[str]) -> Row:
         "lane_invasions_per_km": events["lane_invasion"] / (driven_m / 1000),
         "distance_m": driven_m,
     }
+
+
+def lateral_jerk_rms(times_s: Floats, truth: list[Row]) -> float | None:
+    """Return the RMS of the change of speed x yaw rate, from samples every 0.1 s."""
+    sampled_s = np.array([0.1 * number for number in range(math.ceil(times_s[-1] / 0.1 - 1e-9))])
+    if len(sampled_s) < 3:
+        return None
+    heading_rad = np.interp(sampled_s, times_s, np.unwrap(column(truth, "heading_rad")))
+    speed_mps = np.interp(sampled_s, times_s, column(truth, "speed_mps"))
+    lateral_mps2 = speed_mps[1:] * (heading_rad[1:] - heading_rad[:-1]) / 0.1
+    return float(np.sqrt(np.mean(((lateral_mps2[1:] - lateral_mps2[:-1]) / 0.1) ** 2)))
 
 
 def count_reversals(angles_rad: Sequence[float]) -> int:
