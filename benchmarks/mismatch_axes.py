@@ -85,13 +85,19 @@ AXES = {
     "speed_report": Axis("reported speed / true speed", "vehicle.speed_report_factor", (0.75, 0.9, 1.1, 1.25), 1.0),
     "jitter": Axis("jitter of the video, ms", "network.video.jitter_ms", (10, 20, 40), 0),
     "control_jitter": Axis("jitter of the control, ms", "network.control.jitter_ms", (10, 20, 40), 0),
-    "loss": Axis("loss of frames, each independently", "network.video.loss", (0.05, 0.1, 0.2), 0),
+    "loss": Axis(
+        "loss of frames, each independently",
+        "network.video.loss",
+        (0.05, 0.1, 0.2),
+        0,
+        ("video.repair_packets=0",),
+    ),
     "bursts": Axis(
         "loss of frames, in bursts of 5",
         "network.video.loss",
         (0.05, 0.1, 0.2),
         0,
-        ("network.video.loss_burst_packets=5",),
+        ("network.video.loss_burst_packets=5", "video.repair_packets=0"),
     ),
     "frame_rate": Axis("frame rate, Hz (tuned for 30)", "camera.rate_hz", (10, 15), 30),
     "position_noise": Axis("noise of the seen lane's position, m", "vehicle.lane_noise_m", (0.02, 0.05, 0.1, 0.2), 0),
@@ -105,8 +111,11 @@ AXES = {
         settings=("routes=[b_key, c_key]", "safety.speed_limit_mps=14"),
     ),
 }
-"""The axes by name. At 40 km/h and above, the bend of `a_key` needs more than the 3 m/s2 that preset and vehicle
-allow."""
+"""The axes by name.
+
+Without pixels, a frame is one packet, so without repair packets each lost packet is a lost frame. At 40 km/h and above,
+the bend of `a_key` needs more than the 3 m/s2 that preset and vehicle allow.
+"""
 
 
 def axis_tables(axis: Axis, runs: Sequence[Mapping[str, Any]]) -> list[str]:
