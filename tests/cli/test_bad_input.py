@@ -448,6 +448,7 @@ COMMANDS = [
     "study",
     "boundary",
     "report",
+    "compliance",
     "replay",
     "server",
     "client",

@@ -42,6 +42,7 @@ GROUPS = {
         "boundary": "Find the maximum tolerable latency.",
         "study": "Drive a study: participants, balanced conditions, tests.",
         "report": "Write a report of finished runs.",
+        "compliance": "Judge the latency of finished drives by a limit.",
         "join": "Join the records of two machines into one run.",
     },
     "Network and clocks": {
@@ -75,6 +76,7 @@ ON_ANY_SYSTEM = {
     "boundary",
     "study",
     "report",
+    "compliance",
     "join",
     "road",
     "perception",

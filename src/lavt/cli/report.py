@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,8 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from lavt.cli import console
+from lavt.cli.run_directories import find_runs, sweep_names
 from lavt.errors import UserError, WorkError
-from lavt.experiment.analysis.results import read_json, read_result
+from lavt.experiment.analysis.results import read_failed, read_json, read_result
 from lavt.experiment.runs.run import RESULT, compute_result
 from lavt.recording.output_directory import disk_errors_named, make_directory
 
@@ -37,11 +37,11 @@ def report(
     out = out or directories[0]
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is not a directory: name another with --out")
-    from lavt.experiment.report.report import read_failed, write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.report.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
     from lavt.experiment.report.side_by_side import side_by_side  # noqa: PLC0415 (the same)
 
     boundaries = [_read_boundary(directory) for directory in directories if (directory / BOUNDARY).is_file()]
-    found_runs = {directory: _find_runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
+    found_runs = {directory: find_runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
     if not found_runs:
         raise UserError(f"{directories[0]} has a boundary but no runs: name the directory of a sweep, too")
     runs = [run for runs_in_directory in found_runs.values() for run in runs_in_directory]
@@ -49,7 +49,7 @@ def report(
     computed = {
         run: compute_result(run, result, result.get("digest")) for run, result in zip(runs, results, strict=True)
     }
-    names = _sweep_names(list(found_runs))
+    names = sweep_names(list(found_runs))
     sweeps = {run: name for directory, name in names.items() for run in found_runs[directory]}
     make_directory(out)
     failed = [run for directory in found_runs for run in read_failed(directory)]
@@ -90,34 +90,9 @@ def _read_answers(directories: Sequence[Path], names: dict[Path, str]) -> list[d
     ]
 
 
-def _sweep_names(directories: Sequence[Path]) -> dict[Path, str]:
-    """Return a unique name for each sweep: the last parts of its directory, as many as needed.
-
-    A single sweep gets no name.
-    """
-    sweeps = [directory for directory in directories if not (directory / RESULT).is_file()]
-    if len(sweeps) < 2:
-        return {}
-    parts = {directory: directory.resolve().parts for directory in sweeps}
-    part_count = 1
-    while max(Counter(parts[directory][-part_count:] for directory in sweeps).values()) > 1:
-        part_count += 1
-    return {directory: "/".join(parts[directory][-part_count:]) for directory in sweeps}
-
-
 def _read_boundary(directory: Path) -> dict[str, Any]:
     boundary: Any = read_json(directory / BOUNDARY)
     lists = [boundary.get(key) for key in ("runs", "groups")] if isinstance(boundary, dict) else []
     if not lists or not all(isinstance(entries, list) and entries for entries in lists):
         raise WorkError(f"{directory / BOUNDARY} has no runs or groups: search again with `lavt boundary`")
     return dict(boundary)
-
-
-def _find_runs(directory: Path) -> list[Path]:
-    """Return the run directories in `directory`, or the directory itself if it is a run."""
-    if (directory / RESULT).is_file():
-        return [directory]
-    runs = sorted(result.parent for result in directory.glob(f"runs/*/{RESULT}"))
-    if not runs:
-        raise UserError(f"{directory} has no finished run: name the directory of a run or a sweep")
-    return runs

@@ -93,6 +93,21 @@ def read_json(path: Path) -> Any:
         raise WorkError(f"cannot read {path}: {error}") from error
 
 
+def read_failed(sweep_dir: Path) -> list[dict[str, str]]:
+    """Return the failed runs of a sweep, each with its name (`run`) and its `reason`.
+
+    Raises `WorkError` for a file with anything else.
+    """
+    if not (sweep_dir / FAILED).is_file():
+        return []
+    failed = read_json(sweep_dir / FAILED)
+    if not isinstance(failed, list) or not all(
+        isinstance(run, dict) and {"run", "reason"} <= set(run) for run in failed
+    ):
+        raise WorkError(f"{sweep_dir / FAILED} is not a list of failed runs: remove it, or sweep again")
+    return failed
+
+
 def read_result(path: Path) -> dict[str, Any]:
     """Read the result of a run; raise `WorkError` if the file is not a result."""
     result = read_json(path)

@@ -10,7 +10,7 @@ import matplotlib as mpl
 
 from lavt.errors import WorkError
 from lavt.experiment.analysis.drive_data import DriveData
-from lavt.experiment.analysis.results import FAILED, read_json, write_json
+from lavt.experiment.analysis.results import read_json, write_json
 from lavt.experiment.report import html_page
 from lavt.experiment.report.boundary_section import boundary_parts
 from lavt.experiment.report.condition_sections import (
@@ -149,11 +149,6 @@ def _chapters(
         html_page.Chapter(VALIDITY, validity),
         html_page.Chapter("Every run", [("All runs", run_parts(report)), ("Lane changes", lane_change_parts(report))]),
     ]
-
-
-def read_failed(sweep_dir: Path) -> list[dict[str, str]]:
-    """Return the failed runs of a sweep, each with its name (`run`) and its `reason`."""
-    return list(read_json(sweep_dir / FAILED)) if (sweep_dir / FAILED).is_file() else []
 
 
 def _read_results(

@@ -10,7 +10,7 @@ import yaml
 from lavt.config import StudyConfig
 from lavt.errors import UserError, WorkError
 from lavt.experiment.analysis.drive_data import DriveData
-from lavt.experiment.analysis.results import FAILED, read_result, write_json
+from lavt.experiment.analysis.results import FAILED, read_failed, read_result, write_json
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.run import RESULT
 from lavt.experiment.study.answers import has_answers, read_answers, write_answers
@@ -89,7 +89,7 @@ def drive_study(blocks: Sequence[Block], out: Path, *, jobs: int | None, on_prog
 
 def report_study(out: Path, drives: Sequence[DriveData] = ()) -> Path:
     """Write the report of all finished runs in `out`, and return its page; `drives` has data that need not be read."""
-    from lavt.experiment.report.report import read_failed, write_report  # noqa: PLC0415 (slow: matplotlib)
+    from lavt.experiment.report.report import write_report  # noqa: PLC0415 (slow: matplotlib)
 
     by_directory = {drive.directory: drive for drive in drives}
     return write_report(out, drives=by_directory, failed=read_failed(out), answers=read_answers(out))
