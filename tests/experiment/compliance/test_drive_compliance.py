@@ -294,6 +294,31 @@ def test_a_drive_without_length() -> None:
         evaluated(Record(Path("empty"), True, {}, {}, 0))
 
 
+def test_bounds_of_random_drives() -> None:
+    """Bounds are in order, no stretch is longer than the time above, and no share rises with the limit."""
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        stamped_ms = np.cumsum(random.choice([30, 60, 400], 12, p=[0.6, 0.3, 0.1])) - 60.0
+        delays_ms = random.uniform(40, 300, 12)
+        frames = [frame(time_ms, None if random.random() < 0.2 else time_ms - 10) for time_ms in stamped_ms]
+        commands = [
+            command(time_ms + delay_ms, time_ms, driver_ms=random.uniform(0, 30))
+            for time_ms, delay_ms in zip(stamped_ms, delays_ms, strict=True)
+        ]
+        server = record(1200, frame=frames, admission=commands, truth=STEADY)
+        before: Mapping[str, Any] | None = None
+        for limit_ms in (60, 120, 300):
+            limits = ComplianceLimits(latency_ms=limit_ms, nominal_mps=12, camera_ms=20)
+            entry = evaluated(server, limits).entry
+            shares = {key: entry[key] for key in ("above_share", "two_way_above_share", "too_fast_share")}
+            assert all(0 <= low <= high <= 1 for low, high in shares.values())
+            for side in (0, 1):
+                assert entry["two_way_above_share"][side] <= entry["above_share"][side] + 1e-9
+                assert entry["longest_above_s"][side] <= entry["above_s"][side] + 1e-9 <= entry["commanded_s"] + 2e-9
+                assert before is None or all(shares[key][side] <= before[key][side] + 1e-9 for key in shares)
+            before = shares
+
+
 def test_the_frame_age_is_that_of_the_metrics(make_run: MakeRun, tmp_path: Path) -> None:
     """From the stamp, the 95th percentile of the frame age is `picture_age_ms.p95` of the run's result."""
     server = read_record(make_run(tmp_path, seconds=2.0) / "server.mcap")

@@ -31,11 +31,13 @@ MakeRun = Callable[..., Path]
 LIMITS = ComplianceLimits(latency_ms=150.0, nominal_mps=10.0)
 
 
-def add_run(make_run: MakeRun, directory: Path, *, time: str = "virtual", **settings: Any) -> Path:
+def add_run(
+    make_run: MakeRun, directory: Path, *, time: str = "virtual", controller: str = "lane_keeper", **settings: Any
+) -> Path:
     """Write the records and the result of a synthetic drive; the camera reports 8 ms from capture to stamp."""
     make_run(directory, **{"seconds": 1.0, "capture_ms": 8.0, **settings})
     identity = {"run": directory.name, "time": time, "injection": "model", "route": "a", "condition": "L0"}
-    identity |= {"fidelity": "video", "driver": "lane_keeper", "inherent": "loopback", "controller": "lane_keeper"}
+    identity |= {"fidelity": "video", "driver": "lane_keeper", "inherent": "loopback", "controller": controller}
     server, client = read_record(directory / "server.mcap"), read_record(directory / "client.mcap")
     write_json(directory / "result.json", run_result(identity, server, client))
     return directory
@@ -130,6 +132,17 @@ def test_a_drive_in_real_time_has_its_date(fleet: FleetCompliance) -> None:
     fast, real, _ = (drive.entry for drive in fleet.drives)
     assert fast["began"] is None
     assert real["began"] == "2023-11-14T22:13:20+00:00"
+
+
+def test_the_page_of_a_person_counts(make_run: MakeRun, tmp_path: Path) -> None:
+    """If a person drives, the client's record is read: without reports of the page, the two-way latency has bounds."""
+    directory = add_run(make_run, tmp_path / "person", controller="human", seconds=0.5)
+    entry = evaluate_fleet([directory], LIMITS).drives[0].entry
+    low_ms, high_ms = entry["two_way_ms"]["p50"]
+    assert high_ms - low_ms >= 3.0  # the client's time in the synthetic drive
+    (directory / "client.mcap").write_bytes(b"")
+    with pytest.raises(UserError, match=r"client\.mcap is cut or damaged"):
+        evaluate_fleet([directory], LIMITS)
 
 
 def test_a_fleet_without_a_drive(runs: list[Path]) -> None:

@@ -67,7 +67,6 @@ def evaluate_drive(
     began_ns, ended_ns, ending = driving_interval(server)
     if began_ns > ended_ns:
         raise WorkError("the record has no drive: the vehicle was never armed")
-    nominal_mps = limits.nominal_mps or LIMITS.speed_limit_mps
     duration_ns = float(ended_ns - began_ns)
     changes = state_changes(server.table("event"), (began_ns, ended_ns))
     commanded = time_in(COMMANDED, changes, duration_ns)
@@ -80,15 +79,11 @@ def evaluate_drive(
     speeds = speed_reports(server, began_ns)
     gaps = outages(commands.fresh_ns, commanded, limits.outage_ms * NS_PER_MS)
     stops = manoeuvres(changes, speeds)
-    age_ns = _within(commands.frame_age(), commanded)
-    two_way_ns = _within(commands.two_way_latency(gaps), commanded)
-    blind_m = blind_distance(age_ns, speeds)
-    limit_ns = limits.latency_ms * NS_PER_MS
-    blind_limit_m = nominal_mps * limits.latency_ms / 1000
-    longest_above = _longest(age_ns, limit_ns)
-    total_s = sum(end - begin for begin, end in commanded) / NS_PER_S
+    age_ns, two_way_ns = (_within(pair, commanded) for pair in (commands.frame_age(), commands.two_way_latency(gaps)))
     degraded = time_in(("degraded",), changes, duration_ns)
-    too_fast = excess(blind_m, speeds, nominal_mps)
+    total_s = sum(end - begin for begin, end in commanded) / NS_PER_S
+    latency = _latency_entry(age_ns, two_way_ns, limits.latency_ms * NS_PER_MS, total_s)
+    began_s = latency["longest_above_began_s"]
     entry: dict[str, Any] = {
         **{key: identity.get(key) for key in IDENTITY},
         "ending": ending,
@@ -98,31 +93,58 @@ def evaluate_drive(
         "commanded_s": total_s,
         "distance_m": speeds.distance_m(0.0, duration_ns),
         "age_from": "capture" if commands.is_from_capture else "stamp",
+        **latency,
+        "longest_above_began": None if began_s is None else _moment(server, began_ns, identity, began_s),
+        **_stop_entry(gaps, stops),
+        "degraded_s": sum(end - begin for begin, end in degraded) / NS_PER_S,
+        "driver_overrides": sum(change.after == "disarmed" for change in changes),
+        **_speed_entry(age_ns, speeds, limits, total_s),
+    }
+    verdicts = {key: verdict_of(as_bounds(entry[key]), limits.threshold(key)) for key in CRITERIA}
+    entry |= {"verdicts": verdicts, "verdict": worst_of(list(verdicts.values()))}
+    return DriveCompliance(directory, entry, age_ns, two_way_ns, speeds, gaps, stops, duration_ns)
+
+
+def _latency_entry(
+    age_ns: tuple[Ramps, Ramps], two_way_ns: tuple[Ramps, Ramps], limit_ns: float, total_s: float
+) -> dict[str, Any]:
+    return {
         "picture_age_ms": _spread(age_ns, NS_PER_MS),
         "above_s": _time_above(age_ns, limit_ns),
         "above_share": _share_above(age_ns, limit_ns, total_s),
-        **longest_above,
-        "longest_above_began": _moment(server, began_ns, identity, longest_above["longest_above_began_s"]),
+        **_longest(age_ns, limit_ns),
         "two_way_ms": _spread(two_way_ns, NS_PER_MS),
         "two_way_above_share": _share_above(two_way_ns, limit_ns, total_s),
+    }
+
+
+def _stop_entry(gaps: Sequence[Interval], stops: Sequence[Manoeuvre]) -> dict[str, Any]:
+    lengths_s = [(end - begin) / NS_PER_S for begin, end in gaps]
+    return {
         "outages": len(gaps),
-        "outage_s": sum(end - begin for begin, end in gaps) / NS_PER_S,
-        "longest_outage_s": max((end - begin for begin, end in gaps), default=0.0) / NS_PER_S,
+        "outage_s": sum(lengths_s),
+        "longest_outage_s": max(lengths_s, default=0.0),
         "outage_list": [_interval_entry(gap) for gap in gaps],
-        "degraded_s": sum(end - begin for begin, end in degraded) / NS_PER_S,
-        "driver_overrides": sum(change.after == "disarmed" for change in changes),
         "manoeuvres": len(stops),
         "longest_manoeuvre_s": _longest_manoeuvre(stops),
         "manoeuvre_list": [_manoeuvre_entry(stop) for stop in stops],
+    }
+
+
+def _speed_entry(
+    age_ns: tuple[Ramps, Ramps], speeds: SpeedReports, limits: ComplianceLimits, total_s: float
+) -> dict[str, Any]:
+    nominal_mps = limits.nominal_mps or LIMITS.speed_limit_mps
+    blind_limit_m = nominal_mps * limits.latency_ms / 1000
+    blind_m = blind_distance(age_ns, speeds)
+    too_fast = excess(blind_m, speeds, nominal_mps)
+    return {
         "speed_source": speeds.source,
         "nominal_kmh": nominal_mps * 3.6,
         "blind_distance_m": {**_spread(blind_m, 1.0), "limit": blind_limit_m},
         "too_fast_s": _time_above(too_fast, blind_limit_m),
         "too_fast_share": _share_above(too_fast, blind_limit_m, total_s),
     }
-    verdicts = {key: verdict_of(as_bounds(entry[key]), limits.threshold(key)) for key in CRITERIA}
-    entry |= {"verdicts": verdicts, "verdict": worst_of(list(verdicts.values()))}
-    return DriveCompliance(directory, entry, age_ns, two_way_ns, speeds, gaps, stops, duration_ns)
 
 
 def _within(bounds: tuple[Ramps, Ramps], intervals: Sequence[Interval]) -> tuple[Ramps, Ramps]:
@@ -188,8 +210,8 @@ def _interval_entry(interval: Interval) -> dict[str, float]:
     return {"began_s": begin_ns / NS_PER_S, "length_s": (end_ns - begin_ns) / NS_PER_S}
 
 
-def _moment(server: Record, began_ns: int, identity: Mapping[str, Any], after_s: float | None = 0.0) -> str | None:
+def _moment(server: Record, began_ns: int, identity: Mapping[str, Any], after_s: float = 0.0) -> str | None:
     """Return a moment of the drive by the server's wall clock as ISO 8601 in UTC; None in virtual time."""
-    if after_s is None or identity.get("time") != "real":
+    if identity.get("time") != "real":
         return None
     return calendar_time(wall_ns_at(server, began_ns + round(after_s * NS_PER_S))).isoformat()
