@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 from lavt.errors import UserError, VehicleError
 from lavt.vehicle.carla.frames import CarlaPose
 from lavt.vehicle.carla.library import SUPPORTED
+from lavt.vehicle.carla.probe import NoServerError, ask_version
 from lavt.vehicle.carla.settings import CarlaSettings
 
 SUBSTEP_S: Final = 0.01
@@ -21,6 +22,8 @@ MIN_SUBSTEPS, MAX_SUBSTEPS = 10, 16
 OTHER_CLIENT_WAIT_S: Final = 1.0
 """A synchronous world that does not tick for this long is ticked by nobody."""
 ADDRESS_KEYS: Final = "vehicle.carla.host and vehicle.carla.port"
+MAX_VERSION_LENGTH: Final = 30
+"""A server's version is shown up to this length."""
 
 
 _all_clients: list[Any] = []
@@ -65,20 +68,33 @@ def sentences(settings: CarlaSettings, work: str) -> Iterator[None]:
 def connect(carla: Any, settings: CarlaSettings) -> Any:
     """Return a client; raise `UserError` if no server answers, or one of another version."""
     try:
-        client = _find_client(carla, settings)  # which looks up the host's name
-        found = client.get_server_version()
+        _check_version(ask_version(settings.host, settings.port, settings.timeout_s), settings)
+        client = _find_client(carla, settings)
+        _check_version(client.get_server_version(), settings)
+    except NoServerError as error:
+        raise _no_server(settings, str(error)) from None
     except RuntimeError:
-        forget_client(settings)
-        raise UserError(
-            f"no CARLA server answers at {settings.address} within {settings.timeout_s:g} s: start CARLA {SUPPORTED} "
-            f"there, or set {ADDRESS_KEYS}"
-        ) from None
-    if found != SUPPORTED:
-        raise UserError(
-            f"the CARLA server at {settings.address} has version {found!r}, but LAVT supports {SUPPORTED} only: start "
-            f"CARLA {SUPPORTED}, or set {ADDRESS_KEYS}"
-        )
+        raise _no_server(settings, f"no answer came within {settings.timeout_s:g} s") from None
     return client
+
+
+def _check_version(found: str | None, settings: CarlaSettings) -> None:
+    """Raise `UserError` for another version than the supported one; None is a version that is not known yet."""
+    if found is None or found == SUPPORTED:
+        return
+    shown = repr(found if len(found) <= MAX_VERSION_LENGTH else f"{found[:MAX_VERSION_LENGTH]}...")
+    raise UserError(
+        f"the CARLA server at {settings.address} has version {shown}, but LAVT supports {SUPPORTED} only: start "
+        f"CARLA {SUPPORTED}, or set {ADDRESS_KEYS}"
+    )
+
+
+def _no_server(settings: CarlaSettings, reason: str) -> UserError:
+    forget_client(settings)
+    return UserError(
+        f"no CARLA server answers at {settings.address}, because {reason}: start CARLA {SUPPORTED} there, or set "
+        f"{ADDRESS_KEYS}"
+    )
 
 
 def forget_client(settings: CarlaSettings) -> None:
