@@ -14,6 +14,8 @@ VERSION = "0.9.16"
 WORLD_STREAM = 1
 COLLISION_SENSOR, CAMERA_SENSOR, WORLD_SENSOR = 0, 13, 17
 """The types of sensors in the header of sensor data."""
+APPLY_VEHICLE_CONTROL = 2
+"""The number of a command in a batch."""
 BOOL, INT, FLOAT, STRING = 1, 2, 3, 4
 """The types of attributes."""
 VEHICLE, CAMERA = "vehicle.lincoln.mkz_2020", "sensor.camera.rgb"

@@ -113,6 +113,7 @@ class StandInServer:
             "get_physics_control": lambda number: wire.value(world.physics_control(number)),
             "get_wheel_steer_angle": lambda number, _: wire.value(world.wheel_deg(number)),
             "apply_control_to_vehicle": self._control,
+            "apply_batch": self._batch,
             "set_actor_target_velocity": lambda *_: wire.done(),
             "set_actor_transform": self._place,
             "get_weather_parameters": lambda: wire.value(wire.WEATHER),
@@ -163,9 +164,9 @@ class StandInServer:
                     pose = wire.WirePose((float(x_m), -float(y_m), 0.0))
                     world.spawn([0, wire.VEHICLE, [["role_name", wire.STRING, "parked"]]], pose)
                     return "parked"
-                case ["keep", kind]:
-                    world.kept_kind = kind
-                    return "kept"
+                case ["fault", name, value]:
+                    setattr(world.faults, name, int(value) if value.isdecimal() else value)
+                    return "set"
                 case ["destroy", kind]:
                     number = next(actor.number for actor in world.actors.values() if actor.kind == kind)
                     return str(world.destroy(number))
@@ -203,6 +204,13 @@ class StandInServer:
         self._world.control(number, fields)
         return wire.done()
 
+    def _batch(self, commands: list[Any], _: bool) -> Any:
+        """Apply controls to cars: the only command that LAVT sends in a batch."""
+        for [[kind, [number, fields]]] in commands:
+            assert kind == wire.APPLY_VEHICLE_CONTROL
+            self._world.control(number, fields)
+        return [wire.value(number) for [[_, [number, _]]] in commands]
+
     def _place(self, number: int, pose: Any) -> Any:
         self._world.place(number, wire.pose_of(pose))
         return wire.done()
@@ -236,7 +244,6 @@ def main() -> None:
     parser.add_argument("--scenery", default="full")
     parser.add_argument("--version", default=wire.VERSION)
     parser.add_argument("--camera", type=int, nargs=2, help="prepare the default camera in this size")
-    parser.add_argument("--late-pictures", type=int, default=0)
     given = parser.parse_args()
     streams = Streams()
     world = StandInWorld(
@@ -244,7 +251,6 @@ def main() -> None:
     )
     if given.camera:
         world.prepare_camera(CameraModel(*given.camera))
-    world.late_pictures = given.late_pictures
     server = StandInServer(world, given.version)
     for port, serve in ((given.port, server.serve), (given.port + 1, streams.subscribe)):
         listener = socket.create_server(("127.0.0.1", port))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import msgpack
@@ -90,6 +91,20 @@ class DrivenCar:
         return self._simulator.pose()
 
 
+@dataclass
+class Faults:
+    """What the world does wrong."""
+
+    late_pictures: int = 0
+    """So many of the first ticks of a camera have no picture."""
+    missing_rows: int = 0
+    """Pictures lack so many of their last rows."""
+    garbled_states: int = 0
+    """So many of the next states cannot be read by the package `carla`."""
+    kept_kind: str = ""
+    """Actors of this kind cannot be removed."""
+
+
 class StandInWorld:
     """One episode at a time: actors, settings and the clock of the world. Its user holds a lock around every call."""
 
@@ -105,11 +120,8 @@ class StandInWorld:
         self._prepared: dict[str, Renderer] = {}
         self._numbers, self._streams = itertools.count(20), itertools.count(2)
         self._pictures = itertools.count()
-        self.late_pictures = 0
-        """How many of the first ticks of a camera have no picture."""
         self._withheld: dict[int, int] = {}
-        self.kept_kind = ""
-        """Actors of this kind cannot be removed."""
+        self.faults = Faults()
 
     @property
     def is_synchronous(self) -> bool:
@@ -137,6 +149,9 @@ class StandInWorld:
         for actor in actors:
             self._report_collision(actor, collided)
         state = wire.snapshot_data(self.episode, platform_s, dt_s, actors)
+        if self.faults.garbled_states:
+            self.faults.garbled_states -= 1
+            state = state[:-1]
         self._publish(wire.WORLD_STREAM, self._header(wire.WORLD_SENSOR, WirePose()) + state)
         for actor in actors:  # pictures come last, because they take longest
             self._take_picture(actor)
@@ -163,13 +178,13 @@ class StandInWorld:
         if kind == wire.VEHICLE:
             self._cars[actor.number] = DrivenCar(self.road, actor, self.elapsed_ns)
         if kind == wire.CAMERA:
-            self._withheld[actor.number] = self.late_pictures
+            self._withheld[actor.number] = self.faults.late_pictures
             self._renderers[actor.number] = self._build_renderer(actor)
         return actor.packed(self._stream_port)
 
     def destroy(self, number: int) -> bool:
         """Remove an actor; return whether it existed and is not of the kind that is kept."""
-        if number in self.actors and self.actors[number].kind == self.kept_kind:
+        if number in self.actors and self.actors[number].kind == self.faults.kept_kind:
             return False
         self._cars.pop(number, None)
         self._renderers.pop(number, None)
@@ -240,6 +255,7 @@ class StandInWorld:
     def _picture(self, actor: WireActor) -> bytes:
         pose = self._cars[actor.parent].rear_axle_pose()
         picture = self._renderers[actor.number].render(pose, next(self._pictures))
+        picture = picture[: len(picture) - self.faults.missing_rows]
         height_px, width_px, _ = picture.shape
         bgra = np.full((height_px, width_px, 4), 255, np.uint8)
         bgra[:, :, :3] = picture

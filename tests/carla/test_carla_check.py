@@ -14,6 +14,7 @@ from tests.carla.stand_in import StandIn, stand_in
 
 from lavt.cli import carla as carla_command
 from lavt.cli.main import main
+from lavt.vehicle.carla import session
 from lavt.vehicle.carla.check import CarlaCheck
 from lavt.vehicle.contract import CHECKS
 
@@ -104,6 +105,7 @@ def test_a_server_that_dies_during_the_check_still_gives_a_log(
 ) -> None:
     """If the server is killed, the items after that fail or are not run, with reasons, and the log is written."""
     with stand_in("--scenery", "none", "--camera", *PICTURE) as server:
+        monkeypatch.setattr(session, "CLOSE_TIMEOUT_S", 0.2)  # it cannot answer
         monkeypatch.setitem(carla_command.STAGES, "contract", lambda *_: kill(server))
         options = ("--port", str(server.port), *SIZE, "--set", "vehicle.carla.tick_timeout_s=1.0")
         out = tmp_path / "out"

@@ -18,7 +18,7 @@ from tests.carla.contract_vehicle import blind_settings, server_config
 from tests.carla.stand_in import REPOSITORY, StandIn, free_tcp_pair, need_carla, stand_in
 
 from lavt.assembly.vehicles import build_carla, carla_settings
-from lavt.config import ServerCameraConfig
+from lavt.config import ServerCameraConfig, ServerConfig
 from lavt.domain import NS_PER_S, Actuation, Now
 from lavt.errors import UserError, VehicleError
 from lavt.vehicle.carla import connection, library, session
@@ -31,6 +31,9 @@ FULL_THROTTLE = Actuation(0.0, 1.0, 0.0)
 CAR = "vehicle.lincoln.mkz_2020"
 CAR_AND_SENSORS = f"{CAR} sensor.other.collision sensor.other.lane_invasion"
 TIMEOUT_S = 1.0
+HOPELESS_S = 0.2
+"""The time-out for closing a session with a server that cannot answer."""
+PICTURE = ("320", "240")
 KILLED_CLIENT = """
 import os, sys
 from tests.carla.contract_vehicle import blind_settings
@@ -100,11 +103,11 @@ def test_a_server_of_another_version_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_absent_server_is_named() -> None:
-    """Without a server, a sentence names the address."""
+    """Without a server, a sentence names the address, without waiting for the time-out."""
     need_carla()
     port = free_tcp_pair()
-    with pytest.raises(UserError, match=rf"no CARLA server answers at 127\.0\.0\.1:{port} within 1 s"):
-        CarlaSession(blind_settings(port, timeout_s=TIMEOUT_S)[0])
+    with pytest.raises(UserError, match=rf"answers at 127\.0\.0\.1:{port}, because no program listens there: start"):
+        CarlaSession(blind_settings(port, timeout_s=600.0)[0])
 
 
 def test_a_camera_of_another_source_is_refused() -> None:
@@ -186,7 +189,7 @@ def test_a_leftover_that_the_server_keeps_is_named_and_stands_still() -> None:
             stdout=subprocess.DEVNULL,
         )
         assert killed.returncode == -9
-        assert server.ask("keep", CAR) == "kept"
+        assert server.ask("fault", "kept_kind", CAR) == "set"
         with pytest.raises(VehicleError, match=f"did not remove {CAR}, which a killed run left: restart it"):
             CarlaSession(blind_settings(server.port, timeout_s=20.0)[0])
         assert server.ask("actors") == CAR
@@ -198,7 +201,7 @@ def test_a_car_that_the_server_keeps_is_left_braked_in_a_frozen_world() -> None:
     """If the server does not remove the car at the end, the world stays frozen and the car is braked."""
     with stand_in() as server:
         with driving(server.port):
-            assert server.ask("keep", CAR) == "kept"
+            assert server.ask("fault", "kept_kind", CAR) == "set"
         assert server.ask("actors") == CAR
         assert server.ask("settings").startswith("True")
         assert server.ask("control", CAR) == "0.0 1.0 True"
@@ -213,23 +216,34 @@ def test_a_sensor_that_another_client_destroyed_does_not_hinder_the_end(server: 
     assert server.ask("settings") == "False [False]"
 
 
-def test_a_camera_that_another_client_destroyed_ends_the_run() -> None:
+def pictured_config(port: int) -> ServerConfig:
+    """Return a config with a camera of the size for which the stand-in server is prepared."""
+    width_px, height_px = map(int, PICTURE)
+    camera = ServerCameraConfig(source="carla", width_px=width_px, height_px=height_px)
+    return server_config(port, tick_timeout_s=TIMEOUT_S, timeout_s=20.0).model_copy(update={"camera": camera})
+
+
+@pytest.fixture(scope="module")
+def camera_server() -> Iterator[StandIn]:
+    """Start a stand-in server that the faults of cameras share."""
+    with stand_in("--scenery", "none", "--camera", *PICTURE) as started:
+        yield started
+
+
+def test_a_camera_that_another_client_destroyed_ends_the_run(camera_server: StandIn) -> None:
     """Without its camera the car cannot be driven: the next picture fails with a sentence, not with a wait forever."""
-    with stand_in("--scenery", "none", "--camera", "320", "240") as server:
-        config = server_config(server.port, tick_timeout_s=TIMEOUT_S, timeout_s=20.0)
-        size = ServerCameraConfig(source="carla", width_px=320, height_px=240)
-        setup = build_carla(config.model_copy(update={"camera": size}))
-        assert setup.start is not None
-        with contextlib.ExitStack() as opened:
-            opened.callback(setup.close)
-            vehicle = setup.start(Now(0, 0))
-            vehicle.advance(NS_PER_S)
-            assert setup.camera.capture(1, NS_PER_S, None) is not None
-            assert server.ask("destroy", "sensor.camera.rgb") == "True"
-            vehicle.advance(2 * NS_PER_S)
-            with pytest.raises(VehicleError, match="the camera is gone"):
-                setup.camera.capture(2, 2 * NS_PER_S, None)
-        assert server.ask("actors") == ""
+    setup = build_carla(pictured_config(camera_server.port))
+    assert setup.start is not None
+    with contextlib.ExitStack() as opened:
+        opened.callback(setup.close)
+        vehicle = setup.start(Now(0, 0))
+        vehicle.advance(NS_PER_S)
+        assert setup.camera.capture(1, NS_PER_S, None) is not None
+        assert camera_server.ask("destroy", "sensor.camera.rgb") == "True"
+        vehicle.advance(2 * NS_PER_S)
+        with pytest.raises(VehicleError, match="the camera is gone"):
+            setup.camera.capture(2, 2 * NS_PER_S, None)
+    assert camera_server.ask("actors") == ""
 
 
 def test_a_car_that_another_client_destroyed_ends_the_run(server: StandIn) -> None:
@@ -286,14 +300,16 @@ def test_a_second_ticking_client_is_refused(server: StandIn) -> None:
         assert server.ask("actors") == CAR_AND_SENSORS
 
 
-def test_a_frozen_server_ends_the_run_and_its_car_stands_still() -> None:
+def test_a_frozen_server_ends_the_run_and_its_car_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
     """A frozen server gives a sentence after the tick's time-out; when it goes on, its world moves by one tick only."""
     with stand_in() as server, driving(server.port) as opened:
         frame = int(server.ask("frame"))
         server.freeze()
+        monkeypatch.setattr(session, "CLOSE_TIMEOUT_S", HOPELESS_S)
         with pytest.raises(VehicleError, match="did not complete a tick"):
             opened.tick(FULL_THROTTLE)
         opened.close()
+        monkeypatch.undo()
         server.resume()
         assert int(server.ask("frame")) <= frame + 1
         assert server.ask("settings").startswith("True")
@@ -301,27 +317,47 @@ def test_a_frozen_server_ends_the_run_and_its_car_stands_still() -> None:
             assert server.ask("actors") == CAR_AND_SENSORS
 
 
-def test_a_killed_server_ends_the_run() -> None:
+def test_a_killed_server_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """A killed server gives a sentence, closing the session does not wait for it, and it is absent for the next run."""
     with stand_in() as server, driving(server.port) as opened:
         server.kill()
+        monkeypatch.setattr(session, "CLOSE_TIMEOUT_S", HOPELESS_S)
         with pytest.raises(VehicleError, match="did not complete a tick"):
             opened.tick(FULL_THROTTLE)
         opened.close()
         with pytest.raises(UserError, match="no CARLA server answers"):
-            CarlaSession(blind_settings(server.port, timeout_s=TIMEOUT_S)[0])
+            CarlaSession(blind_settings(server.port)[0])
 
 
-def test_a_late_first_picture_is_awaited(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_late_first_picture_is_awaited(camera_server: StandIn, monkeypatch: pytest.MonkeyPatch) -> None:
     """A camera whose first pictures fail is ticked until one comes; without any, a sentence says what to check."""
     monkeypatch.setattr(session, "MAX_TICKS_TO_PICTURE", 6)
-    for late, is_enough in ((3, True), (100, False)):
-        with stand_in("--scenery", "none", "--camera", "640", "480", "--late-pictures", str(late)) as server:
-            settings = carla_settings(server_config(server.port), load_road("a_key"))
-            if is_enough:
-                with closing(CarlaSession(settings)) as opened:
-                    assert opened.pictures.counts["pictures_read"] >= 1
-                continue
-            with pytest.raises(VehicleError, match="sent no picture in 6 ticks"):
-                CarlaSession(settings)
-            assert server.ask("actors") == ""
+    settings = carla_settings(pictured_config(camera_server.port), load_road("a_key"))
+    try:
+        assert camera_server.ask("fault", "late_pictures", 3) == "set"
+        with closing(CarlaSession(settings)) as opened:
+            assert opened.pictures.counts["pictures_read"] >= 1
+        assert camera_server.ask("fault", "late_pictures", 100) == "set"
+        with pytest.raises(VehicleError, match="sent no picture in 6 ticks"):
+            CarlaSession(settings)
+        assert camera_server.ask("actors") == ""
+    finally:
+        camera_server.ask("fault", "late_pictures", 0)
+
+
+def test_pictures_of_another_size_end_the_run(camera_server: StandIn) -> None:
+    """Pictures that suddenly have another size are counted and never used; the run ends with both sizes named."""
+    setup = build_carla(pictured_config(camera_server.port))
+    assert setup.start is not None
+    with contextlib.ExitStack() as opened:
+        opened.callback(setup.close)
+        vehicle = setup.start(Now(0, 0))
+        vehicle.advance(NS_PER_S)
+        assert setup.camera.capture(1, NS_PER_S, None) is not None
+        assert camera_server.ask("fault", "missing_rows", 1) == "set"
+        vehicle.advance(2 * NS_PER_S)
+        with pytest.raises(VehicleError, match="sends pictures of 320x239 pixels instead of 320x240"):
+            setup.camera.capture(2, 2 * NS_PER_S, None)
+        assert setup.camera.counts["pictures_malformed"] > 0  # type: ignore[attr-defined]
+        camera_server.ask("fault", "missing_rows", 0)
+    assert camera_server.ask("actors") == ""

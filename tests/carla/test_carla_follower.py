@@ -59,8 +59,8 @@ class FixedClock:
         return Now(START_NS, 0)
 
 
-def snapshot(frame: int, elapsed_s: float) -> Snapshot:
-    return Snapshot(frame, FlatPose(0.0, 0.0, 0.0), 0.0, 0.0, 1, elapsed_s)
+def snapshot(frame: int, elapsed_s: float, platform_s: float = 0.0) -> Snapshot:
+    return Snapshot(frame, FlatPose(0.0, 0.0, 0.0), 0.0, 0.0, 1, elapsed_s, platform_s)
 
 
 def follow(follower: Follower, world_s: float, clock_s: float, *, count: int, first: int = 1) -> None:
@@ -104,6 +104,21 @@ def test_a_world_at_another_pace_is_late(pace: float, is_late: bool) -> None:
     assert sum(late_ms) == pytest.approx(0.03 * 20_000 if is_late else 0.0, rel=0.1)
 
 
+@pytest.mark.parametrize(
+    ("pace", "lag", "is_late"),
+    [(1.0, 0.0, False), (0.98, 0.0, False), (1.0001, 0.0, False), (1.0, 0.002, True), (1.0, 0.0001, False)],
+)
+def test_a_way_that_becomes_longer_is_told_from_a_slow_world(pace: float, lag: float, is_late: bool) -> None:
+    """States that arrive later and later by the clock of CARLA's machine are counted; those of a slow world are not."""
+    follower = Follower(RecordedWorld())
+    for number in range(1000):
+        at_s = 0.02 * number
+        arrived_ns = START_NS + round((at_s + lag * at_s) * NS_PER_S)
+        follower.note(snapshot(number, 100 + pace * at_s, 7e5 + at_s), arrived_ns)
+    assert (follower.counts["states_late"] > 600) == is_late
+    assert follower.counts["states_late"] == 0 or is_late
+
+
 def test_the_first_states_only_give_the_time() -> None:
     """The first states are not used; of the others, times increase, and frames that did not arrive are counted."""
     follower = Follower(RecordedWorld())
@@ -120,7 +135,7 @@ def test_the_first_states_only_give_the_time() -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("field", ["pose", "speed_mps", "steering_rad", "elapsed_s"])
+@pytest.mark.parametrize("field", ["pose", "speed_mps", "steering_rad", "elapsed_s", "platform_s"])
 def test_values_that_are_not_finite_are_refused(field: str, value: float) -> None:
     """A pose, speed, angle or time that is not finite is an error of the server, not a state of the car."""
     wrong = FlatPose(value, 0.0, 0.0) if field == "pose" else value
@@ -238,16 +253,18 @@ def test_a_failed_thread_fails_the_actuator() -> None:
         follower.tick_until(START_NS)
 
 
-def guard_with(speeds_mps: list[float], *texts: bytes) -> int:
-    """Run the guard's loop on a pipe with some texts, which is then closed; return how often it braked."""
+class RecordedBrake(guarding.CarBrake):
+    """A brake that records its controls."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[float, bool]] = []
+        super().__init__(lambda steer, hand_brake: self.sent.append((steer, hand_brake)))
+
+
+def guard_with(*texts: bytes) -> list[tuple[float, bool]]:
+    """Run the guard's loop on a pipe with some texts, which is then closed; return its steers and hand brakes."""
     reading, writing = os.pipe()
-    left = list(speeds_mps)
-    brakings = []
-
-    def brake() -> bool:
-        brakings.append(1)
-        return (left.pop(0) if left else 0.0) == 0.0
-
+    brake = RecordedBrake()
     for text in texts:
         os.write(writing, text)
     os.close(writing)
@@ -255,20 +272,28 @@ def guard_with(speeds_mps: list[float], *texts: bytes) -> int:
         guarding.guard(reading, brake)
     finally:
         os.close(reading)
-    return len(brakings)
+    return brake.sent
 
 
 def test_the_guard_does_not_brake_after_a_farewell() -> None:
     """A guard that was told to end does not touch the car."""
-    assert guard_with([5.0], guarding.BEAT * 3, guarding.FAREWELL) == 0
+    assert guard_with(b"<0.100000>" * 3, guarding.FAREWELL) == []
 
 
-def test_the_guard_brakes_a_dead_process_to_standstill(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a farewell, the guard brakes until the car is stationary, at least for a second, at most for a minute."""
+@pytest.mark.parametrize(
+    ("beats", "steer"),
+    [
+        (b"", guarding.TRIAL_STEER),
+        (b"<0.100000><-0.250000>", -0.25),
+        (b"00000><0.300000><0.4", 0.3),
+        (b"<9.000000><nan><>", guarding.TRIAL_STEER),
+    ],
+)
+def test_the_guard_brakes_a_dead_process(monkeypatch: pytest.MonkeyPatch, beats: bytes, steer: float) -> None:
+    """Without a farewell the guard brakes for some seconds with the steer of the newest whole beat, then parks."""
     monkeypatch.setattr(guarding, "pause", lambda _: None)
-    assert guard_with([], guarding.BEAT) == guarding.MIN_BRAKINGS
-    assert guard_with([5.0] * 30, guarding.BEAT) == 31
-    assert guard_with([5.0] * 9999, guarding.BEAT) == guarding.MAX_BRAKINGS
+    sent = guard_with(beats)
+    assert sent == [(steer, False)] * (guarding.LAST_BRAKINGS - 1) + [(steer, True)]
 
 
 def test_the_guard_brakes_a_silent_process_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -276,19 +301,25 @@ def test_the_guard_brakes_a_silent_process_and_goes_on(monkeypatch: pytest.Monke
     monkeypatch.setattr(guarding, "BEAT_TIMEOUT_S", 0.0)
     monkeypatch.setattr(guarding, "REPEAT_S", 0.0)
     reading, writing = os.pipe()
-    brakings = [0]
+    brakings = []
 
-    def brake() -> bool:
-        brakings.append(brakings[-1] + 1)
-        if brakings[-1] == 3:
-            os.write(writing, guarding.BEAT)
-            os.write(writing, guarding.FAREWELL)
-        return False
+    def send(steer: float, hand_brake: bool) -> None:
+        brakings.append((steer, hand_brake))
+        if len(brakings) == 3:
+            os.write(writing, b"<0.100000>" + guarding.FAREWELL)
 
-    guarding.guard(reading, brake)
-    assert brakings[-1] == 3
+    guarding.guard(reading, guarding.CarBrake(send))
+    assert brakings == [(guarding.TRIAL_STEER, False)] * 3
     for end in (reading, writing):
         os.close(end)
+
+
+def test_a_guard_that_does_not_reach_the_car_is_noticed() -> None:
+    """The steer of the guard's first control must appear in the car's states, sooner or later."""
+    steerings_rad = iter([0.0] * 5 + [-guarding.TRIAL_STEER * 0.5])
+    guarding.await_trial(lambda: next(steerings_rad), 0.5)
+    with pytest.raises(VehicleError, match="does not reach the car"):
+        guarding.await_trial(lambda: 0.0, 0.5)
 
 
 def test_an_asynchronous_world_needs_real_time() -> None:

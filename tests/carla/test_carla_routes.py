@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 import yaml
 from tests.carla.stand_in import REPOSITORY, stand_in
+
+from lavt.cli.main import main
 
 pytestmark = pytest.mark.full
 
@@ -18,23 +19,24 @@ PICTURE = ("320", "240")
 LARGEST_DIFFERENCE_M = 0.01
 
 
-def run_lavt(directory: Path, *words: object) -> list[str]:
-    """Run a command in a directory, and return the lines that it printed."""
-    done = subprocess.run(
-        [sys.executable, "-m", "lavt", *map(str, words)],
-        cwd=directory,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY / "src")},
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
+def run_lavt(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], *words: object) -> list[str]:
+    """Run a command in this process, which saves the imports, and return the lines that it printed."""
+    capfd.readouterr()
+    monkeypatch.setattr(sys, "argv", ["lavt", *map(str, words)])
+    with pytest.raises(SystemExit) as raised:
+        main()
+    printed, messages = capfd.readouterr()
+    assert not raised.value.code, messages
+    return printed.splitlines()
 
 
-def test_an_imported_route_is_driven_in_both_and_compared(tmp_path: Path) -> None:
+def test_an_imported_route_is_driven_in_both_and_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """One config drives lanes of a small map in both vehicles, and one command prints the results side by side."""
-    run_lavt(tmp_path, "road", "import", HAMLET, "--from", "1,1", "--to", "1,1", "--out", "hamlet.yaml")
+    monkeypatch.chdir(tmp_path)
+    run = partial(run_lavt, monkeypatch, capfd)
+    run("road", "import", HAMLET, "--from", "1,1", "--to", "1,1", "--out", "hamlet.yaml")
     config = {
         "vehicle": {"scenery": "none"},
         "camera": {"width_px": int(PICTURE[0]), "height_px": int(PICTURE[1])},
@@ -44,11 +46,11 @@ def test_an_imported_route_is_driven_in_both_and_compared(tmp_path: Path) -> Non
     }
     (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(config))
     options = ("sweep.yaml", "--jobs", "1", "--out")
-    run_lavt(tmp_path, "sweep", *options, "out/simulator")
+    run("sweep", *options, "out/simulator")
     with stand_in("--road", str(tmp_path / "hamlet.yaml"), "--scenery", "none", "--camera", *PICTURE) as server:
         changes = ("--set", "vehicle.kind=carla", "--set", f"vehicle.carla.port={server.port}")
-        run_lavt(tmp_path, "sweep", *options, "out/carla", *changes, "--set", "vehicle.carla.timeout_s=30.0")
-    header, line, last = run_lavt(tmp_path, "report", "out/simulator", "out/carla", "--out", "out/both")
+        run("sweep", *options, "out/carla", *changes, "--set", "vehicle.carla.timeout_s=30.0")
+    header, line, last = run("report", "out/simulator", "out/carla", "--out", "out/both")
     assert header.split()[:4] == ["route", "condition", "simulator:", "completed"]
     assert line.split()[:5] == ["hamlet", "L0", "1", "of", "1"]
     assert line.split()[6:9] == ["1", "of", "1"]

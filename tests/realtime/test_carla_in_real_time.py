@@ -24,7 +24,7 @@ PICTURE = ("320", "240")
 TIME_LIMIT_S = 6.0
 MEDIAN_ERROR_MS = 2.0
 MIN_LATE_SHARE = 0.2
-DRIVES_AFTER_S = 10.0
+DRIVES_MPS = 1.0
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class TimedDrive:
     ended_ns: int
 
 
-def planned(server: StandIn, time_limit_s: float) -> PlannedRun:
+def planned(server: StandIn, time_limit_s: float, *more: str) -> PlannedRun:
     changes = (
         "time=real",
         "vehicle.kind=carla",
@@ -46,6 +46,7 @@ def planned(server: StandIn, time_limit_s: float) -> PlannedRun:
         f"vehicle.time_limit_s={time_limit_s}",
         f"camera.width_px={PICTURE[0]}",
         f"camera.height_px={PICTURE[1]}",
+        *more,
     )
     return plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes))
 
@@ -84,8 +85,20 @@ def test_capture_times_are_those_of_the_ticks(drive: TimedDrive, stalls: Stalls)
 def test_a_server_killed_during_a_drive_ends_the_run(tmp_path: Path) -> None:
     """If the CARLA server is killed during a drive, the run ends with an error that names the server."""
     with stand_in("--scenery", "none", "--camera", *PICTURE) as server:
-        killer = threading.Timer(DRIVES_AFTER_S, server.kill)
+        has_ended = threading.Event()
+
+        def kill_when_it_drives() -> None:
+            while not has_ended.wait(0.1):
+                if max(map(float, server.ask("speed").split()), default=0.0) > DRIVES_MPS:
+                    server.kill()
+                    return
+
+        killer = threading.Thread(target=kill_when_it_drives)
         killer.start()
-        with pytest.raises(LavtError, match="CARLA server"):
-            run_once(planned(server, 60.0), tmp_path / "run")
-        killer.join()
+        try:
+            with pytest.raises(LavtError, match="CARLA server"):
+                run_once(planned(server, 60.0, "vehicle.carla.tick_timeout_s=2.0"), tmp_path / "run")
+        finally:
+            has_ended.set()
+            killer.join()
+        assert server.process.returncode is not None, "the run ended before the server was killed"

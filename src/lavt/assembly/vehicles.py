@@ -24,7 +24,7 @@ from lavt.vehicle.camera import Camera, FrameTimes, TimedCamera
 from lavt.vehicle.carla.camera import CarlaCamera
 from lavt.vehicle.carla.follower import Follower
 from lavt.vehicle.carla.frames import FlatPose
-from lavt.vehicle.carla.guard import Guard
+from lavt.vehicle.carla.guard import Guard, await_trial
 from lavt.vehicle.carla.session import BRAKED, CarlaSession
 from lavt.vehicle.carla.settings import CarlaSettings
 from lavt.vehicle.carla.ticker import Ticker
@@ -110,7 +110,8 @@ def build_carla(config: ServerConfig) -> VehicleSetup:
     def start(now: Now) -> Vehicle:
         limit_s = config.vehicle.time_limit_s
         if settings.is_asynchronous:
-            guards.append(Guard(settings, session.car_number))
+            guards.append(Guard(settings, session.car_number, lambda: session.steer))
+            await_trial(lambda: session.wait_for_state().steering_rad, session.max_steering_rad)
             follower = Follower(session, beat=guards[0].beat)
             camera.ticker = follower
             tickers.append(follower)

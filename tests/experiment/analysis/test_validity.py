@@ -44,6 +44,11 @@ def test_a_run_without_faults_is_valid(make_run: MakeRun, tmp_path: Path) -> Non
             InvalidCode.RECORD_OVERFLOW,
             "3 messages",
         ),
+        (
+            {"server_counts": (("carla_states", 990), ("carla_states_late", 10))},
+            InvalidCode.STATES_LATE,
+            "10 of 990 states",
+        ),
         ({"step_s": 0.02}, InvalidCode.CLOCK_STEP, "+20.0 ms"),
         ({"bound_s": None, "probes": False}, InvalidCode.CLOCK_BOUND, ""),
         ({"bound_s": 0.0011}, InvalidCode.CLOCK_BOUND, "2.20 ms"),
@@ -73,6 +78,7 @@ def test_each_infrastructure_fault_makes_the_run_invalid(
     [
         {"late": 1},
         {"skipped": 3, "server_counts": (("record_overflow", 0),)},
+        {"server_counts": (("carla_states", 1000), ("carla_states_late", 10))},
         {"step_s": 0.0005},
         {"slow_frame_ms": 9.0},
         {"spread_ms": 60.0},  # of tau_v: jitter of the network
@@ -82,7 +88,7 @@ def test_each_infrastructure_fault_makes_the_run_invalid(
     ],
 )
 def test_small_faults_are_tolerated(make_run: MakeRun, tmp_path: Path, settings: dict[str, Any]) -> None:
-    """A run is valid with small faults: late physics, missed frames, clock steps, unsampled clocks, loop jitter."""
+    """A run is valid with small faults: late physics, missed frames, clock steps, late states, loop jitter."""
     assert reasons(make_run, tmp_path, **settings) == []
 
 

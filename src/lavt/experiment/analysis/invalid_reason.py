@@ -25,6 +25,7 @@ class InvalidCode(StrEnum):
     CLOSURE = "closure"
     PHYSICS_LATE = "physics_late"
     FRAMES_MISSED = "frames_missed"
+    STATES_LATE = "states_late"
     LOOP_JITTER = "loop_jitter"
     INJECTION_DIFFERS = "injection_differs"
     INJECTION_NOT_MEASURED = "injection_not_measured"

@@ -30,6 +30,8 @@ LATE_LIMIT = 0.01
 """The largest allowed share of the drive by which the physics is late in total; delays up to 50 ms are ignored."""
 MISSED_FRAMES_LIMIT = 0.01
 """The largest allowed share of frames that the camera misses."""
+LATE_STATES_LIMIT = 0.01
+"""The largest allowed share of states of an asynchronous CARLA world whose times are late (`carla/world_time.py`)."""
 LOOP_JITTER_LIMIT_MS = 10.0
 """The largest allowed loop jitter. On an idle machine with two cores, the 95th percentile of the whole loop latency,
 network included, was 3.4 ms above its median (docs/measuring_latency.md). The limit is three times that value: a run
@@ -103,6 +105,13 @@ def _simulator_reasons(server: Record) -> list[InvalidReason]:
     if missed_count > MISSED_FRAMES_LIMIT * due_count:
         text = f"the camera missed {missed_count} of {due_count} frames (limit {MISSED_FRAMES_LIMIT:.0%})"
         reasons.append(InvalidReason(InvalidCode.FRAMES_MISSED, text))
+    states_late, state_count = last_count(server, "carla_states_late") or 0, last_count(server, "carla_states") or 0
+    if states_late > LATE_STATES_LIMIT * state_count:
+        text = (
+            f"{states_late} of {state_count} states of CARLA got times that are over 10 ms late, by the clock of its "
+            f"machine (limit {LATE_STATES_LIMIT:.0%})"
+        )
+        reasons.append(InvalidReason(InvalidCode.STATES_LATE, text))
     return reasons
 
 

@@ -54,7 +54,7 @@ class Follower(TickHistory):
         super().__init__()
         self._world, self._beat = world, beat
         self._time = WorldTime()
-        self._counts = Counter({"states": 0, "states_missed": 0})
+        self._counts = Counter({"states": 0, "states_missed": 0, "states_late": 0})
         self._last_frame: int | None = None
         self._watch = ActuatorWatch()
         self._commanded = threading.Condition()
@@ -68,7 +68,7 @@ class Follower(TickHistory):
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Return the numbers of states, of those that did not arrive, and of silences of the actuator."""
+        """Return the numbers of states, of those that did not arrive or have late times, and of actuator silences."""
         return {**self._counts, "silences": self._watch.silences}
 
     @property
@@ -117,12 +117,14 @@ class Follower(TickHistory):
     def note(self, snapshot: Snapshot, arrived_ns: int) -> None:
         """Take a state with its time of arrival; the first `CALIBRATION_TICKS` only give the world's time."""
         due_ns = self._time.state_ns(round(snapshot.elapsed_s * NS_PER_S), arrived_ns)
+        is_late = self._time.is_late(due_ns, round(snapshot.platform_s * NS_PER_S), arrived_ns)
         self._counts["states"] += 1
         if self._last_frame is not None:
             self._counts["states_missed"] += max(0, snapshot.frame - self._last_frame - 1)
         self._last_frame = snapshot.frame
         if self._counts["states"] <= CALIBRATION_TICKS:
             return
+        self._counts["states_late"] += is_late
         events = self._world.take_events()
         if drift_ns := self._time.take_drift_ns():
             events.append(CarlaEvent(snapshot.frame, "late", f"{drift_ns // NS_PER_MS} ms"))

@@ -2,18 +2,22 @@
 
 The server keeps the last control of a client that is gone, so only another client can brake the car. LAVT's process
 writes into the guard's standard input all the time. If that stops, the guard brakes until it goes on; if the pipe is
-closed without a farewell, the guard brakes until the car is stationary.
+closed without a farewell, the guard brakes for some seconds, and the server keeps the brake.
+
+A state that the package `carla` cannot read aborts each process that reads the world's states. So the guard reads none:
+it gets the steer to keep from LAVT's process, and sends its controls with `apply_batch`, which needs no world.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import select
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, Final
+from typing import Final
 
 from lavt.clock import Clock, MachineClock, pause
 from lavt.domain import NS_PER_S
@@ -23,16 +27,20 @@ from lavt.vehicle.carla.library import load_library
 from lavt.vehicle.carla.settings import CarlaSettings
 
 BEAT: Final = b"."
+"""The guard's answer. A beat of LAVT's process is the steer of its last control in angle brackets."""
+STEER: Final = re.compile(rb"<(-?[01]\.\d+)>")
 FAREWELL: Final = b"e"
 READY: Final = b"ready\n"
+TRIAL_STEER: Final = 0.01
+"""The guard brakes once at its start, with this steer, by which LAVT's process recognizes its control."""
+TRIAL_STATES: Final = 150
+"""In so many states of the world this control must be in force."""
 BEAT_TIMEOUT_S: Final = 0.3
 """The guard brakes if it has read nothing for this long. The process itself brakes after 0.2 s if only its actuator
 hangs."""
 REPEAT_S: Final = 0.1
-MIN_BRAKINGS, MAX_BRAKINGS = 10, 600
-"""After the death of the process, the guard brakes at least this often, because the newest state may be from before,
-and at most this often, because the server may be dead, too."""
-STATIONARY_MPS: Final = 0.05
+LAST_BRAKINGS: Final = 100
+"""After the death of the process, the guard brakes this often; with the last one it pulls the hand brake."""
 START_TIMEOUT_S: Final = 30.0
 END_TIMEOUT_S: Final = 2.0
 MAX_UNANSWERED: Final = 150
@@ -43,9 +51,13 @@ CALL_TIMEOUT_S: Final = 1.0
 
 
 class Guard:
-    """The guard's process, as LAVT's process sees it. Raises `VehicleError` if the guard does not find the car."""
+    """The guard's process, as LAVT's process sees it; `steer` returns the steer to keep when it brakes.
 
-    def __init__(self, settings: CarlaSettings, car: int) -> None:
+    Raises `VehicleError` if the guard does not find the server.
+    """
+
+    def __init__(self, settings: CarlaSettings, car: int, steer: Callable[[], float]) -> None:
+        self._steer = steer
         command = [sys.executable, "-m", __name__, settings.host, str(settings.port), str(settings.timeout_s), str(car)]
         # A session of its own: Ctrl-C in the terminal must not end it.
         self._process = subprocess.Popen(  # noqa: S603 (our own program)
@@ -61,7 +73,7 @@ class Guard:
             line = b""
         if line != READY:
             self.end()
-            raise VehicleError("the guard, which brakes the car if LAVT dies, did not find the car: restart CARLA")
+            raise VehicleError("the guard, which brakes the car if LAVT dies, did not find the server: restart CARLA")
         for pipe in (self._input, self._output):
             os.set_blocking(pipe.fileno(), False)
         self._unanswered = 0
@@ -71,7 +83,7 @@ class Guard:
         if self._input is None or self._output is None or self._process.poll() is not None:
             raise VehicleError("the guard, which brakes the car if LAVT dies, has ended: start the run again")
         with suppress(BlockingIOError, BrokenPipeError):  # full: the guard is frozen; broken: the next call raises
-            os.write(self._input.fileno(), BEAT)
+            os.write(self._input.fileno(), b"<%.6f>" % self._steer())
         with suppress(BlockingIOError):
             self._unanswered += 1
             if os.read(self._output.fileno(), 4096):
@@ -102,11 +114,10 @@ class Guard:
             self._process.wait()
 
 
-def guard(beats: int, brake: Callable[[], bool], answer: Callable[[], None] = lambda: None) -> None:
+def guard(beats: int, brake: CarBrake, answer: Callable[[], None] = lambda: None) -> None:
     """Brake while nothing can be read from the file descriptor `beats`; return after a farewell.
 
-    At the end of the pipe, brake until the car is stationary, at most for a minute, and return. `brake` brakes once,
-    and returns whether the car is stationary. `answer` is called after each reading.
+    At the end of the pipe, brake `LAST_BRAKINGS` times, and return. `answer` is called after each reading.
     """
     timeout_s = BEAT_TIMEOUT_S
     while True:
@@ -120,12 +131,24 @@ def guard(beats: int, brake: Callable[[], bool], answer: Callable[[], None] = la
             return
         if not text:
             break
+        brake.read_steer(text)
         answer()
         timeout_s = BEAT_TIMEOUT_S
-    for count in range(1, MAX_BRAKINGS + 1):
-        if brake() and count >= MIN_BRAKINGS:
-            break
+    for count in range(1, LAST_BRAKINGS + 1):
+        brake(hand_brake=count == LAST_BRAKINGS)
         pause(round(REPEAT_S * NS_PER_S))
+
+
+def await_trial(next_steering_rad: Callable[[], float], max_steering_rad: float) -> None:
+    """Wait until the guard's first control is in force; raise `VehicleError` if it is not.
+
+    `next_steering_rad` waits for the car's next state, and returns the angle of the control in it; until the guard
+    brakes it is 0.
+    """
+    for _ in range(TRIAL_STATES):
+        if next_steering_rad() < -0.3 * TRIAL_STEER * max_steering_rad:  # not exactly, because of the steering curve
+            return
+    raise VehicleError("the guard, which brakes the car if LAVT dies, does not reach the car: restart CARLA")
 
 
 class BeatAnswer:
@@ -149,23 +172,20 @@ class BeatAnswer:
 
 
 class CarBrake:
-    """The brake of an actor; each call brakes once."""
+    """The brake of an actor, which `send` gives a control; each call brakes once."""
 
-    def __init__(self, carla: Any, car: Any) -> None:
-        self._carla, self._car = carla, car
-        self._calls = 0
+    def __init__(self, send: Callable[[float, bool], None]) -> None:
+        self._send = send
+        self._steer = TRIAL_STEER
 
-    def __call__(self) -> bool:
-        """Brake with the wheels where they were commanded; return whether the car is stationary."""
-        self._calls += 1
-        is_stationary = bool(self._car.get_velocity().length() < STATIONARY_MPS)
-        steer = self._car.get_control().steer
-        # The package does not send a control that is equal to the last one, so each is a little different.
-        steer -= (self._calls % 2) * (1e-6 if steer >= 0.0 else -1e-6)
-        self._car.apply_control(
-            self._carla.VehicleControl(throttle=0.0, steer=steer, brake=1.0, hand_brake=is_stationary)
-        )
-        return is_stationary
+    def read_steer(self, beats: bytes) -> None:
+        """Keep the steer of the newest whole beat, if there is one."""
+        if steers := STEER.findall(beats):
+            self._steer = float(steers[-1])
+
+    def __call__(self, *, hand_brake: bool = False) -> None:
+        """Brake with the wheels where they were commanded."""
+        self._send(self._steer, hand_brake)
 
 
 def main() -> int:
@@ -174,13 +194,16 @@ def main() -> int:
     try:
         carla = load_library()
         client = connect(carla, CarlaSettings(host, int(port), 0.1, None, timeout_s=float(timeout_s)))
-        car = client.get_world().get_actor(int(number))
-        if car is None:
-            return 1
         client.set_timeout(CALL_TIMEOUT_S)
+
+        def send(steer: float, hand_brake: bool) -> None:
+            control = carla.VehicleControl(throttle=0.0, steer=steer, brake=1.0, hand_brake=hand_brake)
+            client.apply_batch([carla.command.ApplyVehicleControl(int(number), control)])
+
+        brake = CarBrake(send)
+        brake(hand_brake=True)
         os.write(sys.stdout.fileno(), READY)
-        answer = BeatAnswer(client.get_server_version, MachineClock(), sys.stdout.fileno())
-        guard(sys.stdin.fileno(), CarBrake(carla, car), answer)
+        guard(sys.stdin.fileno(), brake, BeatAnswer(client.get_server_version, MachineClock(), sys.stdout.fileno()))
     except (LavtError, RuntimeError):  # the server is gone, and with it the car
         return 1
     return 0

@@ -31,7 +31,7 @@ def check_finite(values: Iterable[float], address: str) -> None:
 def checked(snapshot: Snapshot, address: str) -> Snapshot:
     """Return a snapshot; raise `VehicleError` for values that no car can have."""
     speed_mps, steering_rad = snapshot.speed_mps, snapshot.steering_rad
-    check_finite((*snapshot.pose, speed_mps, steering_rad, snapshot.elapsed_s), address)
+    check_finite((*snapshot.pose, speed_mps, steering_rad, snapshot.elapsed_s, snapshot.platform_s), address)
     if abs(speed_mps) > MAX_SPEED_MPS or abs(steering_rad) >= MAX_WHEEL_RAD:
         raise _impossible(f"{speed_mps:.3g} m/s and a steering angle of {steering_rad:.3g} rad", address)
     return snapshot

@@ -71,7 +71,7 @@ class CarlaSession:
 
     def __init__(self, settings: CarlaSettings) -> None:
         self.settings = settings
-        self.pictures = PictureBox()
+        self.pictures = PictureBox(settings.camera or CameraModel())
         self._carla = load_library()
         self._events: deque[CarlaEvent] = deque()
         self._actors: list[Any] = []
@@ -85,6 +85,7 @@ class CarlaSession:
         self._steering_curve: tuple[tuple[float, float], ...] = ()
         self._frame = 0
         self._dither = 0.0
+        self.steer = 0.0  # of the last control
         self._sent = SentControls()
         self._elapsed_s = 0.0
         self._start = FlatPose(0.0, 0.0, 0.0)
@@ -166,6 +167,7 @@ class CarlaSession:
             -control.steer * self._max_steering_rad * self._curve_factor(math.hypot(*velocity)),
             control.gear,
             self._elapsed_s,
+            state.timestamp.platform_timestamp,
         )
         return checked(snapshot, self.settings.address)
 
@@ -186,7 +188,8 @@ class CarlaSession:
             return town_of(self._world)
 
     def check_camera(self) -> None:
-        """Raise `VehicleError` if another client has destroyed the camera."""
+        """Raise `VehicleError` if another client has destroyed the camera, or if its pictures have another size."""
+        self.pictures.check_size(self.settings.address)
         camera = next((actor for actor in self._actors if actor.type_id == CAMERA), None)
         with sentences(self.settings, "list its actors"):
             is_there = camera is None or self._world.get_snapshot().has_actor(camera.id)
@@ -237,8 +240,6 @@ class CarlaSession:
     def _is_ticked_by_another(self) -> bool:
         """Return whether another client has ticked the world since: if it ran by itself, that client's car drove on."""
         return not self.settings.is_asynchronous and 0 < self._frame < self._world.get_snapshot().frame
-
-    # The car.
 
     def _spawn_car(self) -> Any:
         settings = self.settings
@@ -303,8 +304,6 @@ class CarlaSession:
             )
         self._steering_curve = curve
 
-    # Sensors.
-
     def _add_sensors(self) -> None:
         with sentences(self.settings, "spawn the sensors"):
             origin = CarlaPose(0.0, 0.0, 0.0)
@@ -335,6 +334,7 @@ class CarlaSession:
             self.tick(BRAKED, hand_brake=True)
             if self.pictures.wait_for_any(PICTURE_WAIT_S):
                 return
+            self.pictures.check_size(self.settings.address)
         raise VehicleError(
             f"the CARLA server at {self.settings.address} sent no picture in {MAX_TICKS_TO_PICTURE} ticks: start it "
             "with rendering (-RenderOffScreen, not -nullrhi)"
@@ -354,12 +354,10 @@ class CarlaSession:
             blueprint.set_attribute("role_name", self.settings.role_name)
         return blueprint
 
-    # Driving.
-
     def apply(self, actuation: Actuation, *, hand_brake: bool = False) -> None:
         """Put an actuation in force, without waiting for the server."""
         factor = self._curve_factor(self._car.get_velocity().length())
-        steer = steer_for(actuation.steering_rad, self._max_steering_rad, factor)
+        steer = self.steer = steer_for(actuation.steering_rad, self._max_steering_rad, factor)
         if self.settings.is_asynchronous:
             self._dither = STEER_DITHER - self._dither
             steer -= math.copysign(self._dither, steer)

@@ -62,3 +62,5 @@ class Snapshot(Struct, frozen=True):
     """-1 is reverse."""
     elapsed_s: float = 0.0
     """The time that has elapsed in the world; 0 in a synchronous world, whose ticks have due times."""
+    platform_s: float = 0.0
+    """The time of the clock of the server's machine; 0 in a synchronous world."""
