@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -15,7 +13,6 @@ from lavt.domain import NS_PER_MS, NS_PER_S, FloatArray, Now
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.virtual_run import build_loop, drive, free_finished_loops
 from lavt.nodes.payloads import Admission, FrameWritten
-from lavt.runtime.recorder import Recorders
 
 CHANNELS = frozenset({"truth", "event", "frame", "admission"})
 """The channels that are kept in memory."""
@@ -26,6 +23,8 @@ NEVER_NS = 2**62
 
 class InMemoryRecorder:
     """A recorder that keeps the payloads of `CHANNELS` in memory."""
+
+    channels = CHANNELS
 
     def __init__(self) -> None:
         self.payloads: defaultdict[str, list[Any]] = defaultdict(list)
@@ -58,15 +57,12 @@ class MonitoredRun:
 def drive_monitored(planned: PlannedRun, *, limit_s: float = 3600.0) -> MonitoredRun:
     """Drive a run in virtual time without records, and return its monitored quantities.
 
-    The drive is identical to a drive of `run_once`. Its record files are in a temporary directory and remain empty.
+    The drive is identical to a drive of `run_once`.
     """
     cv2.setNumThreads(1)
     recorder = InMemoryRecorder()
-    with TemporaryDirectory() as directory:
-        loop = build_loop(planned, Path(directory) / "run")
-        loop.runtime.hosts["server"].recorder = Recorders(loop.observer, recorder)
-        loop.runtime.hosts["client"].recorder = InMemoryRecorder()
-        drive(loop, limit_ns=round(limit_s * NS_PER_S))
+    loop = build_loop(planned, None, watcher=recorder)
+    drive(loop, limit_ns=round(limit_s * NS_PER_S))
     del loop
     free_finished_loops(planned.config)
     return summarize_drive(recorder.payloads)

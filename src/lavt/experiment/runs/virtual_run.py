@@ -9,12 +9,13 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 from lavt.assembly.entropy import SeededEntropy
 from lavt.assembly.fidelity import FIDELITIES
 from lavt.assembly.links import trace_digests
 from lavt.assembly.nodes import ClientNodes, ServerNodes, build_client, build_server
+from lavt.channels import CHANNELS
 from lavt.config import Condition, Costs, RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_S, NS_PER_US, GroundTruth, Now
@@ -24,7 +25,7 @@ from lavt.experiment.runs.side_configs import client_config, server_config
 from lavt.recording.output_directory import make_directory
 from lavt.recording.provenance import provenance
 from lavt.recording.record import RecordWriter
-from lavt.runtime.recorder import Recorders
+from lavt.runtime.recorder import Recorder, Recorders
 from lavt.runtime.virtual import Cost, HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
 from lavt.streams import QuantileStream
 from lavt.transport.emulation.delay_line import DelayLine, DelayModel
@@ -45,8 +46,19 @@ AFTER_ENDING_NS = NS_PER_S // 5
 """The recording continues for this time after the ending of the drive."""
 
 
+class LoopWatcher(Recorder, Protocol):
+    """A recorder of both sides, which gets at least the entries of `channels` while the loop runs."""
+
+    @property
+    def channels(self) -> frozenset[str]:
+        """The channels whose entries it needs, even if nothing is recorded."""
+        ...
+
+
 class DriveObserver:
     """A recorder that observes the start and the ending of the drive, and keeps nothing else."""
+
+    channels: ClassVar[frozenset[str]] = frozenset({"truth", "event"})
 
     def __init__(self) -> None:
         self.began = False
@@ -76,8 +88,15 @@ class VirtualLoop:
     server: ServerNodes
     client: ClientNodes
     observer: DriveObserver
-    writers: tuple[RecordWriter, RecordWriter]
+    writers: tuple[RecordWriter, ...]
+    """Those of server and client; none if nothing is recorded."""
     digest: Any
+
+    def close(self) -> None:
+        """Close the vehicle's connections, and complete the records."""
+        self.server.setup.close()
+        for writer in self.writers:
+            writer.close()
 
 
 @functools.cache
@@ -94,10 +113,16 @@ def host_clocks(config: RunConfig) -> tuple[HostClock, HostClock]:
     )
 
 
-def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostClock] | None = None) -> VirtualLoop:
+def build_loop(
+    planned: PlannedRun,
+    out: Path | None,
+    *,
+    clocks: tuple[HostClock, HostClock] | None = None,
+    watcher: LoopWatcher | None = None,
+) -> VirtualLoop:
     """Build both sides of a run, which record into `out`, and the links between them; create `out` if needed.
 
-    Raises `UserError` for an invalid config, before the directory is created.
+    If `out` is None, nothing is recorded. Raises `UserError` for an invalid config, before the directory is created.
     """
     config, seed = planned.config, planned.seed
     server_clock, client_clock = clocks or host_clocks(config)
@@ -106,11 +131,18 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     requested = planned.requested
     digest = hashlib.sha256()
     left_out = config.left_out
-    server_writer = RecordWriter(out / "server.mcap", "server", digest, left_out=left_out)
-    client_writer = RecordWriter(out / "client.mcap", "client", digest, left_out=left_out)
-    for writer in (server_writer, client_writer):
+    writers: tuple[RecordWriter, ...] = ()
+    if out is not None:
+        writers = tuple(
+            RecordWriter(out / f"{side}.mcap", side, digest, left_out=left_out) for side in ("server", "client")
+        )
+    for writer in writers:
         _annotate(writer, costs, requested)
     observer = DriveObserver()
+    watching = () if watcher is None else (watcher,)
+    if out is None:
+        left_out = frozenset(CHANNELS).difference(observer.channels, *(each.channels for each in watching))
+    client_recorders: tuple[Recorder, ...] = (*watching, *writers[1:])
     costs_ns = stage_costs_ns(costs, seed)
     error_s, bound_s = config.clocks.error_us / 1e6, config.clocks.bound_us / 1e6
     hosts = [
@@ -118,7 +150,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
             "server",
             server_clock,
             server.all,
-            Recorders(observer, server_writer),
+            Recorders(observer, *watching, *writers[:1]),
             costs_ns,
             modelled_clock_source(server_clock, "virtual-server", error_s, bound_s),
             left_out=left_out,
@@ -127,7 +159,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
             "client",
             client_clock,
             client.all,
-            client_writer,
+            client_recorders[0] if len(client_recorders) == 1 else Recorders(*client_recorders),
             costs_ns,
             modelled_clock_source(client_clock, "virtual-client", -error_s, bound_s),
             CLIENT_ADDRESS,
@@ -137,13 +169,13 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     network = config.network
     injected = injected_network(network.inherent, requested, costs, seed, state_delay=network.state_delay)
     runtime = VirtualRuntime(hosts, virtual_links(injected, costs, seed))
-    return VirtualLoop(runtime, server, client, observer, (server_writer, client_writer), digest)
+    return VirtualLoop(runtime, server, client, observer, writers, digest)
 
 
 def _build_nodes(
-    config: RunConfig, seed: int, server_clock: HostClock, client_clock: HostClock, out: Path
+    config: RunConfig, seed: int, server_clock: HostClock, client_clock: HostClock, out: Path | None
 ) -> tuple[ServerNodes, ClientNodes]:
-    """Build the nodes of both sides, and create `out`; after an error, close the vehicle's connections."""
+    """Build the nodes of both sides, and create `out`, if any; after an error, close the vehicle's connections."""
     fidelity = FIDELITIES[config.fidelity]()
     server = build_server(
         server_config(config, seed),
@@ -161,7 +193,8 @@ def _build_nodes(
             SeededEntropy(seed, "client"),
             fidelity=fidelity,
         )
-        make_directory(out)
+        if out is not None:
+            make_directory(out)
     except BaseException:
         server.setup.close()
         raise
@@ -252,9 +285,7 @@ def drive(loop: VirtualLoop, *, limit_ns: int = RUN_LIMIT_NS, progress: Callable
         runtime.close()
     finally:
         gc.unfreeze()
-        loop.server.setup.close()
-        for writer in loop.writers:
-            writer.close()
+        loop.close()
 
 
 def free_finished_loops(config: RunConfig) -> None:
