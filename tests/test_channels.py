@@ -14,6 +14,7 @@ from lavt.assembly.entropy import SeededEntropy
 from lavt.assembly.nodes import build_client, build_server
 from lavt.channels import CHANNELS, QUEUE_LENGTH
 from lavt.config import (
+    AGENT,
     HUMAN,
     ClientCameraConfig,
     ClientConfig,
@@ -25,13 +26,13 @@ from lavt.config import (
 from lavt.domain import Now
 from lavt.node import WAKE, Node
 
-EXTERNAL_SENDERS = {"clock_source", "console", "injector", "operator", "runtime"}
+EXTERNAL_SENDERS = {"agent", "clock_source", "console", "injector", "operator", "runtime"}
 """The senders in the table that are no nodes."""
 
 
 @pytest.fixture(scope="module")
 def nodes() -> Sequence[Node]:
-    """Return all nodes of both sides, built as for a run, and those of clients that a person drives or watches."""
+    """Return all nodes of both sides, built as for a run, and those of clients with other drivers or with a watcher."""
     camera = ServerCameraConfig(width_px=640, height_px=480)
     server = build_server(
         ServerConfig(vehicle=VehicleConfig(scenery="none"), camera=camera),
@@ -49,12 +50,17 @@ def nodes() -> Sequence[Node]:
             SeededEntropy(1, "client"),
             is_watched=controller != HUMAN,
         )
-        for controller in ("lane_keeper", HUMAN)
+        for controller in ("lane_keeper", HUMAN, AGENT)
     ]
     return [*server.all, *(node for client in clients for node in client.all)]
 
 
-NODE_OF_MODULE = {"picture_reader": "driver", "commander": "driver", "human_driver": "driver"}
+NODE_OF_MODULE = {
+    "picture_reader": "driver",
+    "commander": "driver",
+    "human_driver": "driver",
+    "agent_driver": "driver",
+}
 """The nodes of the modules that are not named after their node."""
 
 

@@ -60,6 +60,7 @@ CHANNELS: dict[str, Channel] = {
     "picture_lost": Channel("local", "driver", ("receiver",)),
     "operator": Channel("local", "operator", ("driver",)),  # a person requests a stop or a release
     "path_token": Channel("local", "driver", ("receiver",)),
+    "agent_action": Channel("local", "agent", ("driver",)),  # what an agent chose in a Gymnasium environment
     "condition_in_force": Channel("local", "injection", ("driver",), "newest"),
     # client, if a person drives: between the driver node and the pages, and to a relay of its own
     "unit_to_decode": Channel("local", "driver", ("driver",)),

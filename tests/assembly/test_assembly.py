@@ -352,7 +352,7 @@ def test_the_predictive_display_is_a_setting_of_a_person_s_drive() -> None:
     assert ControllerConfig(kind="human").settings == ControllerConfig(prediction=shown).settings == "designed"
     assert person.settings == "designed, prediction.shown"
     run = RunConfig(controller=person, time="real")
-    assert plan_run(run, is_study=True).identity["preset"] == "designed, prediction.shown"
+    assert plan_run(run, driver="human").identity["preset"] == "designed, prediction.shown"
     assert client_config(run, 1).controller.prediction.shown
     assert (shown.front_m, shown.rear_m, shown.width_m) == (
         LINCOLN_MKZ.rear_axle_to_front_m,

@@ -392,6 +392,8 @@ BAD_COMMANDS = {
     "a person's drive with jitter": (["drive", "--set", "network.video.jitter_ms=5"], "constant delays"),
     "a person's drive with a long delay": (["drive", "--set", "network.control.delay_ms=2001"], "at most 2000 ms"),
     "a run of a person": (["run", DEMO, "--set", "controller.kind=human"], "lavt drive"),
+    "a run of an agent": (["run", DEMO, "--set", "controller.kind=agent"], "docs/gym.md"),
+    "a client of an agent": (["client", CLIENT, "--set", "controller.kind=agent"], "docs/gym.md"),
     "a watched run in virtual time": (["run", DEMO, "--watch", "--set", "time=virtual"], "time=real"),
     "a watched person": (["client", CLIENT, "--human", "--watch"], "leave it out"),
     "watching without a vehicle": (["client", "--watch"], "name the vehicle's host"),

@@ -173,3 +173,24 @@ def test_a_run_ends_when_finished() -> None:
     assert runtime.true_ns == 40 * MS
     assert not runtime.run(100 * MS, lambda: False)
     assert runtime.true_ns == 100 * MS
+
+
+def test_a_message_can_be_delivered_before_waiting_ones() -> None:
+    """`deliver_first` runs the receiver's pipeline before the waiting messages, which wait until its end."""
+    runtime, actuator = new_runtime(DelayModel(0.0), costs_ns={("actuator", "receive"): 30 * MS})
+    runtime.call_at(60 * MS, runtime.deliver_first, "server", "control", b"first")  # when 3 and 4 wait
+    runtime.run(130 * MS, lambda: False)
+    assert [(payload, began // MS) for payload, _, began in actuator.received[1:5]] == [
+        ((2).to_bytes(2, "big"), 30),
+        (b"first", 60),
+        ((3).to_bytes(2, "big"), 90),
+        ((4).to_bytes(2, "big"), 120),
+    ]
+
+
+def test_no_message_is_delivered_into_a_pipeline() -> None:
+    """`deliver_first` is an error while the receiver is in the middle of a pipeline."""
+    runtime, _ = new_runtime(DelayModel(0.0), costs_ns={("actuator", "receive"): 30 * MS})
+    runtime.run(NS_PER_S, lambda: runtime.true_ns == 40 * MS)
+    with pytest.raises(RuntimeError, match="in the middle of a pipeline"):
+        runtime.deliver_first("server", "control", b"first")

@@ -13,7 +13,8 @@ from lavt.assembly.fidelity import VIDEO, FidelityModel
 from lavt.assembly.injection import injection_client, injection_node
 from lavt.assembly.security import build_cipher
 from lavt.assembly.vehicles import VehicleSetup, check_vehicle, physics_sample_times
-from lavt.config import HUMAN, ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
+from lavt.config import AGENT, HUMAN, ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
+from lavt.control.agent import AgentController
 from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.control.compensation import VARIANTS, CompensatingController
 from lavt.control.drive_controller import DriveController, make_controller
@@ -24,6 +25,7 @@ from lavt.domain import NS_PER_MS, Now
 from lavt.errors import UserError
 from lavt.node import Node
 from lavt.nodes.actuator import ActuatorNode
+from lavt.nodes.agent_driver import AgentDriverNode
 from lavt.nodes.camera import CameraNode
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.clock_sync import ClockSyncNode, ProbingClockSyncNode
@@ -45,6 +47,8 @@ from lavt.transport.video.path_validation import TOKEN_BYTES, PathServer
 from lavt.transport.video.stream_sender import StreamSender
 from lavt.vehicle.camera import FrameTimes
 from lavt.vehicle.vehicle import Vehicle
+
+AGENT_ELSEWHERE = "an agent drives in a Gymnasium environment only (docs/gym.md): name another controller"
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +93,8 @@ def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
     check_vehicle(vehicle)
     if controller.kind == HUMAN:
         build_controls(controller)
+    elif controller.kind == AGENT:
+        build_agent_controller(controller)
     else:
         build_controller(controller)
 
@@ -100,6 +106,8 @@ def build_controller(config: ControllerConfig, seed: int = 1, *, rate_hz: float 
     """
     if config.kind == HUMAN:
         raise UserError("a person drives by `lavt drive` or `lavt client CONFIG --human` only: name another controller")
+    if config.kind == AGENT:
+        raise UserError(AGENT_ELSEWHERE)
     if config.kind == TWO_POINT:
         model = TwoPointSettings(**config.two_point.model_dump())
         return TwoPointDriver(config.effective_preset(), wheelbase_m=config.wheelbase_m, settings=model, seed=seed)
@@ -110,6 +118,11 @@ def build_controller(config: ControllerConfig, seed: int = 1, *, rate_hz: float 
         known = config.compensation.settings_at(rate_hz)
         return CompensatingController(variant, preset, wheelbase_m=config.wheelbase_m, settings=known)
     return make_controller(config.kind, config.effective_preset(), config.wheelbase_m)
+
+
+def build_agent_controller(config: ControllerConfig) -> AgentController:
+    """Build the controller in an agent's place; of the preset, it uses the limits, the speed and the lookahead."""
+    return AgentController(config.effective_preset(), wheelbase_m=config.wheelbase_m)
 
 
 def build_controls(config: ControllerConfig) -> HumanControls:
@@ -255,7 +268,10 @@ def build_client(
     `delays` are those that a person who drives can choose, if any.
     """
     controller = config.controller
-    build_driver = _human_driver(config, fidelity, delays) if controller.kind == HUMAN else _driver(config, fidelity)
+    if controller.kind == HUMAN:
+        build_driver: Callable[[ClientSession], DriverNode | HumanDriverNode] = _human_driver(config, fidelity, delays)
+    else:
+        build_driver = _agent_driver(config, fidelity) if controller.kind == AGENT else _driver(config, fidelity)
     hold_ms = config.video.reorder_hold_ms
     start = now()
     instance = entropy.number(64)
@@ -294,6 +310,16 @@ def _driver(config: ClientConfig, fidelity: FidelityModel) -> Callable[[ClientSe
     controller = build_controller(config.controller, config.seed, rate_hz=config.camera.rate_hz)
     lane_confidence = config.controller.effective_preset().lane_confidence
     return lambda session: DriverNode(
+        reader, detector, controller, session, CLIENT_LIMITS, lane_confidence=lane_confidence
+    )
+
+
+def _agent_driver(config: ClientConfig, fidelity: FidelityModel) -> Callable[[ClientSession], AgentDriverNode]:
+    """Prepare the driver node of an agent; return a function that builds it for a session."""
+    reader, detector = PictureReader(fidelity.receiver(config)), fidelity.detector(config)
+    controller = build_agent_controller(config.controller)
+    lane_confidence = config.controller.effective_preset().lane_confidence
+    return lambda session: AgentDriverNode(
         reader, detector, controller, session, CLIENT_LIMITS, lane_confidence=lane_confidence
     )
 

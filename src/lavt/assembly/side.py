@@ -24,13 +24,13 @@ import yaml
 from lavt.assembly.actuator_process import ActuatorProcess, start_actuator
 from lavt.assembly.clock_source import build_query_process, clock_source
 from lavt.assembly.entropy import MachineEntropy
-from lavt.assembly.nodes import build_client, build_server
+from lavt.assembly.nodes import AGENT_ELSEWHERE, build_client, build_server
 from lavt.assembly.rendezvous import open_flow
 from lavt.assembly.security import Authenticator, build_authenticator, build_gateway
 from lavt.assembly.vehicles import VehicleSetup
 from lavt.assembly.zenoh import side_session
 from lavt.clock import Clock
-from lavt.config import HUMAN, ClientConfig, ServerConfig
+from lavt.config import AGENT, HUMAN, ClientConfig, ServerConfig
 from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.node import Node, Peer
@@ -271,6 +271,8 @@ def open_client(
 
     Raises `UserError` for a wrong config, before the output directory is created.
     """
+    if config.controller.kind == AGENT:
+        raise UserError(AGENT_ELSEWHERE)
     is_human = config.controller.kind == HUMAN
     if is_human and is_watched:
         raise UserError(WATCHED_PERSON)

@@ -11,6 +11,7 @@ from lavt.config.camera import CameraConfig as CameraConfig
 from lavt.config.camera import ClientCameraConfig as ClientCameraConfig
 from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
 from lavt.config.carla import CarlaConfig as CarlaConfig
+from lavt.config.controller import AGENT as AGENT
 from lavt.config.controller import HUMAN as HUMAN
 from lavt.config.controller import CompensationConfig as CompensationConfig
 from lavt.config.controller import ControllerConfig as ControllerConfig

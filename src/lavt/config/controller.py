@@ -15,6 +15,8 @@ from lavt.control.two_point import TWO_POINT, TwoPointSettings
 
 HUMAN = "human"
 """The kind of controller with which a person drives."""
+AGENT = "agent"
+"""The kind of controller with which an agent drives in a Gymnasium environment."""
 
 
 _MODEL = TwoPointSettings()
@@ -113,7 +115,8 @@ class ControllerConfig(Section):
     kind: str = "lane_keeper"
     """lane_keeper: the built-in controller; predictive, smith, constant_delay, scheduled_lookahead and slow_down: lane
     keepers that know the delay (`docs/compensation.md`); two_point: a model of a human driver; human: a person drives
-    from a web page (`docs/drive.md`); or the name of your own (`docs/controllers.md`)."""
+    from a web page (`docs/drive.md`); agent: an agent drives in a Gymnasium environment, which sets this value
+    (`docs/gym.md`); or the name of your own (`docs/controllers.md`)."""
     preset: str = "designed"
     """The set of gains: designed (found by theory) or paper_calibrated (fitted to the paper, `docs/controllers.md`)."""
     lookahead_s: float | None = Field(None, ge=0.2, le=5)

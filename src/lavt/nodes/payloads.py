@@ -155,6 +155,17 @@ class InjectionSample(Struct, frozen=True):
     """Why the condition is not in force, or which measurement deviates from the request; empty: neither."""
 
 
+class AgentAction(Struct, frozen=True):
+    """The action that an agent has chosen from its observation of a picture."""
+
+    stamp_ns: int
+    """Stamp of the picture."""
+    steering_rad: float
+    """Wanted angle of the road wheels."""
+    speed_mps: float
+    """Wanted speed."""
+
+
 class HumanSample(Struct, frozen=True):
     """An input of the person who drives, or a change of the state of the hand without an input."""
 

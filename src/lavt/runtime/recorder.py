@@ -106,6 +106,7 @@ UNRECORDED = frozenset(
         "path_token",
         "access_unit",
         "unit_to_decode",
+        "agent_action",
         "video_reception",
         "page_opened",
         "page_closed",

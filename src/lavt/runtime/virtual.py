@@ -240,6 +240,16 @@ class VirtualRuntime:
             record(host.recorder, channel, payload, arrived)
         self._put(host, Message(channel, payload, arrived, peer))
 
+    def deliver_first(self, side: str, channel: str, payload: Any) -> None:
+        """Deliver a message before all that wait at its receivers, which must not be in the middle of a pipeline."""
+        host = self.hosts[side]
+        now = host.now(self.true_ns)
+        for runner in host.receivers[channel]:
+            if runner.free_ns > self.true_ns:
+                raise RuntimeError(f"{runner.node.name} cannot receive {channel}: it is in the middle of a pipeline")
+            runner.next_step_ns = None  # the waiting messages, and a wake that is due, come after this message
+            self._run_pipeline(runner, Message(channel, payload, now), now)
+
     def _put(self, host: VirtualHost, message: Message) -> None:
         true_ns = self.true_ns
         for runner in host.receivers[message.channel]:

@@ -18,6 +18,7 @@ from lavt.control.two_point import TwoPointDriver
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
 from lavt.experiment.report.tables import FIDELITY_DESCRIPTIONS
+from lavt.experiment.runs.monitored_run import InMemoryRecorder
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.experiment.runs.run import run_once
 from lavt.experiment.runs.virtual_run import build_loop, drive
@@ -115,6 +116,15 @@ def test_records_without_video(fidelity: str, tmp_path: Path) -> None:
     assert {"picture", "lane", "timeline"} <= set(client.tables)
     expected = redundant if fidelity == "pixels" else set()
     assert redundant & set(server.tables) == redundant & set(client.tables) == expected
+
+
+def test_a_loop_without_a_directory_records_nothing() -> None:
+    """A loop without a directory drives as with one, and its watcher gets the channels that it needs."""
+    recorder = InMemoryRecorder()
+    loop = build_loop(planned("fidelity=geometry"), None, watcher=recorder)
+    drive(loop, limit_ns=2 * NS_PER_S)
+    assert loop.writers == ()
+    assert recorder.payloads.keys() == recorder.channels
 
 
 def test_lost_packets_are_lost_frames_at_geometry(tmp_path: Path) -> None:

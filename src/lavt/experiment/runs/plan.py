@@ -13,8 +13,8 @@ from lavt.assembly.detection.detectors import check_detector
 from lavt.assembly.entropy import run_seed
 from lavt.assembly.injection import NO_CONDITION, netem_flows
 from lavt.assembly.links import link_injection
-from lavt.assembly.nodes import check_names
-from lavt.config import HUMAN, Condition, RunConfig, SweepConfig
+from lavt.assembly.nodes import AGENT_ELSEWHERE, check_names
+from lavt.config import AGENT, HUMAN, Condition, RunConfig, SweepConfig
 from lavt.config_file import condition, parse_config
 from lavt.errors import UserError
 from lavt.operating_system import require_loopback, require_real_time
@@ -22,6 +22,13 @@ from lavt.transport.emulation.impairment import check_flows
 
 RESERVED_AXES = {"vehicle.route": "routes", "network.condition": "conditions", "repetition": "repetitions"}
 """The config keys that cannot be further axes, each with the key of a sweep's config that varies it."""
+
+DRIVEN_ELSEWHERE = {
+    HUMAN: "a person drives by `lavt drive`, `lavt client CONFIG --human` or `lavt study` only: name another "
+    "controller",
+    AGENT: AGENT_ELSEWHERE,
+}
+"""The kinds of controllers that are no controllers but drivers outside of LAVT, each with an error message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,17 +48,14 @@ class PlannedRun:
 
 
 def plan_run(
-    config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None, is_study: bool = False
+    config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None, driver: str = ""
 ) -> PlannedRun:
-    """Plan one run; only in a study (`is_study`) can a person drive it.
+    """Plan one run; a person or an agent can drive it only if `driver`, a key of `DRIVEN_ELSEWHERE`, is present.
 
     Raises `UserError` for a condition, route, vehicle, controller or preset that does not exist.
     """
-    if config.controller.kind == HUMAN and not is_study:
-        raise UserError(
-            "a person drives by `lavt drive`, `lavt client CONFIG --human` or `lavt study` only: name another "
-            "controller"
-        )
+    if config.controller.kind in DRIVEN_ELSEWHERE and config.controller.kind != driver:
+        raise UserError(DRIVEN_ELSEWHERE[config.controller.kind])
     requested = config.network.requested(condition(config.network.condition))
     check_names(config.vehicle, config.controller)
     check_detector(config.perception.detector)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lavt.assembly.entropy import participant_seed
-from lavt.config import RunConfig, StudyConfig
+from lavt.config import HUMAN, RunConfig, StudyConfig
 from lavt.config_file import parse_config
 from lavt.errors import UserError
 from lavt.experiment.runs.plan import PlannedRun, plan_run, run_name, with_changes
@@ -56,7 +56,7 @@ def plan_participant(study: StudyConfig, participant: int) -> list[Block]:
             }
             config = parse_config(RunConfig, with_changes(base, changes), "the study")
             name = f"{_prefix(participant)}{order:03d}_{run_name(route, condition, repetition, {})}"
-            runs.append(plan_run(config, name=name, is_study=True))
+            runs.append(plan_run(config, name=name, driver=HUMAN))
         blocks.append(Block(participant, number, condition, runs))
     return blocks
 
