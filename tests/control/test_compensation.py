@@ -6,6 +6,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, replace
 
+import msgspec
 import pytest
 
 from lavt.config import CompensationConfig
@@ -30,6 +31,7 @@ CLOCK_SET_NS = 3 * NS_PER_S
 EXACT = CompensationSettings(camera_delay_s=0.0, average_lag_s=0.0)
 """The camera of this loop stamps a picture at its exposure, and nothing is averaged."""
 PRESET = replace(DESIGNED, speed_mps=SPEED_MPS)
+AHEAD = Lane((0.0, 0.0, 0.0), 3.5, 2.0, 20.0, 1.0)
 
 
 @dataclass
@@ -197,6 +199,31 @@ def test_a_longer_delay_slows_the_car_down() -> None:
         brakes.append(loop.decisions[-1].brake)
     assert brakes[0] < 0.01
     assert brakes[1] > 0.2
+
+
+@pytest.mark.parametrize("step_s", [3.0, 3600.0])
+def test_a_server_that_restarts_with_another_clock_does_not_shorten_the_delay(step_s: float) -> None:
+    """While a restarted server with a faster clock drives nothing yet, `slow_down` keeps the low speed of 600 ms."""
+    known = controller("slow_down")
+    loop = Loop(known, 500, 80)
+    loop.drive(3, offset_m=0.0)
+    clock_ns = loop.vehicle_clock_ns + round(step_s * NS_PER_S)
+    for now_ns in range(3 * NS_PER_S, 4 * NS_PER_S, FRAME_NS):
+        restarted = state(now_ns + clock_ns, now_ns, CarMotion(0.0, 0.0, 0.0, speed_mps=0.0), -1)
+        known.history.note_state(msgspec.structs.replace(restarted, instance=1), now_ns)
+        known.note_stamp(now_ns + clock_ns - 500 * NS_PER_MS)
+        decision = known.decide(AHEAD, SPEED_MPS, now_ns)
+    assert decision.brake == pytest.approx(loop.decisions[-1].brake)
+
+
+def test_a_picture_that_arrives_before_the_state_that_shows_a_step_of_the_clock_is_not_averaged() -> None:
+    """One stamp that is an hour later does not end the low speed of `slow_down`."""
+    known = controller("slow_down")
+    loop = Loop(known, 500, 80)
+    loop.drive(3, offset_m=0.0)
+    known.note_stamp(loop.vehicle_clock_ns + 3603 * NS_PER_S)
+    decision = known.decide(AHEAD, SPEED_MPS, 3 * NS_PER_S)
+    assert decision.brake == pytest.approx(loop.decisions[-1].brake)
 
 
 def test_a_lost_lane_is_followed_from_the_predicted_pose() -> None:

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Final
 
 from lavt.control.loop_history import LoopHistory
-from lavt.control.prediction import MAX_GAP_NS, CarModel, Motion, predict_path
+from lavt.control.prediction import MAX_GAP_NS, MAX_LOOP_NS, CarModel, Motion, predict_path
 from lavt.control.preset import Preset
 from lavt.control.pure_pursuit import (
     PlanarPose,
@@ -176,15 +176,23 @@ class CompensatingController:
         )
 
     def _measure_delay(self, exposed_ns: int, now_ns: int) -> None:
-        """Update the delays by a picture that was exposed at `exposed_ns`; what is unknown now remains."""
+        """Update the delays by a picture that was exposed at `exposed_ns`; what is unknown with this clock remains.
+
+        A total delay that no loop has is left out of the average: the picture is the first one after a step of the
+        clock.
+        """
         settings = self._settings
         if not self._variant.measures_delay:
             self._delay_ns = exposed_ns + round(settings.constant_delay_s * NS_PER_S) - now_ns
-        elif (measured_ns := self.history.delay.at_ns(now_ns)) is not None:
-            self._delay_ns = measured_ns + round(settings.delay_error_s * NS_PER_S)
+        else:
+            measured_ns = self.history.delay.last_ns(now_ns)
+            self._delay_ns = None if measured_ns is None else measured_ns + round(settings.delay_error_s * NS_PER_S)
         if self._delay_ns is None:
             return
-        total_s = (now_ns + self._delay_ns - exposed_ns) / NS_PER_S
+        total_ns = now_ns + self._delay_ns - exposed_ns
+        if not -MAX_LOOP_NS <= total_ns <= MAX_LOOP_NS:
+            return
+        total_s = total_ns / NS_PER_S
         before_s = self._total_delay_s
         self._total_delay_s = total_s if before_s is None else before_s + DELAY_WEIGHT * (total_s - before_s)
 

@@ -39,6 +39,7 @@ class EffectDelay:
         self._newest: State | None = None
         self._bounds: deque[tuple[int, int, int]] = deque(maxlen=MAX_STATES)
         """Arrival of a state, lower and upper bound."""
+        self._last_ns: int | None = None
 
     def note_command(self, sequence: int, now_ns: int) -> None:
         """Note a command that is sent now."""
@@ -60,7 +61,7 @@ class EffectDelay:
 
     def forget_clock(self) -> None:
         """Forget what was measured with the vehicle's clock, because it was set."""
-        self._newest = None
+        self._newest = self._last_ns = None
         self._bounds.clear()
 
     def at_ns(self, now_ns: int) -> int | None:
@@ -70,6 +71,13 @@ class EffectDelay:
         if not self._bounds:
             return None
         return (max(low for _, low, _ in self._bounds) + min(high for _, _, high in self._bounds)) // 2
+
+    def last_ns(self, now_ns: int) -> int | None:
+        """Return the delay or, if it is unknown, what the last call returned; None: there was none with this clock."""
+        measured_ns = self.at_ns(now_ns)
+        if measured_ns is not None:
+            self._last_ns = measured_ns
+        return self._last_ns
 
 
 class LoopHistory:
