@@ -17,7 +17,7 @@ from lavt.experiment.boundary.compensation_margin import (
     compensated_spectral_radius,
     scheduled_loop,
 )
-from lavt.experiment.boundary.delay_margin import LateralLoop, phase_margin_rad, spectral_radius
+from lavt.experiment.boundary.delay_margin import DEFAULT_CAR, LateralLoop, phase_margin_rad, spectral_radius
 from lavt.experiment.boundary.oscillation_growth import straight_growth
 from lavt.perception.lane_detector import SMOOTHING
 
@@ -38,6 +38,16 @@ def test_no_prediction_is_the_loop_without_prediction(total_delay_s: float) -> N
     if radius < 1:
         margin_rad = compensated_phase_margin_rad(loop, NO_PREDICTION, total_delay_s)
         assert margin_rad == pytest.approx(phase_margin_rad(loop, total_delay_s), abs=1e-4)
+
+
+@pytest.mark.parametrize("uses_reports", [True, False])
+def test_a_car_without_steering_lag_has_nearly_the_loop_of_a_short_lag(uses_reports: bool) -> None:
+    """A steering lag of 0, which a config may have, gives the eigenvalues of a lag of 2 ms, with both models."""
+    loops = [LateralLoop(1.01, car=replace(DEFAULT_CAR, steering_lag_s=lag_s)) for lag_s in (0.0, 0.002)]
+    knows = [Predictor(steering_lag_s=loop.car.steering_lag_s, uses_reports=uses_reports) for loop in loops]
+    radii = [compensated_spectral_radius(*known, 0.3) for known in zip(loops, knows, strict=True)]
+    assert radii[0] == pytest.approx(radii[1], abs=1e-3)
+    assert spectral_radius(loops[0], 0.3) == pytest.approx(spectral_radius(loops[1], 0.3), abs=1e-3)
 
 
 def predictor(kind: str) -> Predictor:

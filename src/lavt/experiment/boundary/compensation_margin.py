@@ -37,6 +37,9 @@ from lavt.experiment.boundary.delay_margin import (
 
 _CAR = 5
 """Number of the car's states; lateral error, heading error and wheel angle are 2, 3 and 4."""
+_SHORTEST_LAG_S = 0.005
+"""In a prediction, a shorter steering lag counts as this one: back in time, the wheels' angle grows by exp(time / lag),
+which would leave no digits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,9 +161,10 @@ def _predict(
     `rows` are the averaged errors, of the time `since_s`, and the wheel angle of time 0.
     """
     (loop, predictor), rows = known, rows.copy()
+    assumed_lag_s = max(predictor.steering_lag_s, _SHORTEST_LAG_S)
     end_s = remembered.effect_s
     if predictor.uses_reports:
-        lag_s = loop.car.steering_lag_s
+        lag_s = max(loop.car.steering_lag_s, _SHORTEST_LAG_S)
         for duration_s, command in reversed(list(received.during(since_s, 0.0))):  # back from time 0
             rows[2] = command + (rows[2] - command) * math.exp(duration_s / lag_s)
         reported_s = min(received.effect_s - loop.car.steering_dead_time_s - predictor.unreported_s, end_s)
@@ -171,9 +175,9 @@ def _predict(
         begin_s = since_s - MODEL_MEMORY_S
         rows[2] = remembered.rows[remembered.at(begin_s)]
         for duration_s, command in remembered.during(begin_s, since_s):
-            rows[2] = command + (rows[2] - command) * math.exp(-duration_s / predictor.steering_lag_s)
+            rows[2] = command + (rows[2] - command) * math.exp(-duration_s / assumed_lag_s)
     for duration_s, command in remembered.during(since_s, end_s):
-        rows = _move(rows, command, duration_s, loop.speed_mps, predictor.wheelbase_m, predictor.steering_lag_s)
+        rows = _move(rows, command, duration_s, loop.speed_mps, predictor.wheelbase_m, assumed_lag_s)
     return rows[:2]
 
 

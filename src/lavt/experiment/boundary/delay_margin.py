@@ -44,6 +44,8 @@ DELAY_PER_LOOKAHEAD = math.acos(math.sqrt(2) - 1) / math.sqrt(2 + 2 * math.sqrt(
 DEFAULT_CAR = LINCOLN_MKZ
 """The simulator's car. The model uses only the parameters of its lateral motion at small slip."""
 
+_SHORTEST_LAG_S = 0.001
+"""A shorter steering lag counts as this one, because the model has no car without a lag."""
 _LONGEST_DELAY_S = 3.0  # the search ends here, beyond every delay of interest
 _SEARCH_STEP_S = 0.005
 
@@ -111,8 +113,9 @@ def plant(loop: LateralLoop) -> tuple[FloatArray, FloatArray]:
     a[1] = [coupling / (inertia * speed), -yaw_damping, 0, 0, front * front_arm / inertia]
     a[2] = [1, -rear_arm, 0, speed, 0]
     a[3, 1] = 1
-    a[4, 4] = -1 / car.steering_lag_s
-    return a, np.array([0, 0, 0, 0, 1 / car.steering_lag_s])
+    lag_s = max(car.steering_lag_s, _SHORTEST_LAG_S)
+    a[4, 4] = -1 / lag_s
+    return a, np.array([0, 0, 0, 0, 1 / lag_s])
 
 
 def _advance(a: FloatArray, b: FloatArray, duration_s: float) -> tuple[FloatArray, FloatArray]:
