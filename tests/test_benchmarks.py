@@ -45,6 +45,23 @@ def test_virtual_loop_benchmark_runs() -> None:
         assert f"{stage} " in completed.stdout
 
 
+@pytest.mark.full
+def test_gym_benchmark_runs() -> None:
+    """`benchmarks/gym_steps.py` prints a line for each setting and, last, JSON with steps per second and ratio."""
+    pytest.importorskip("gymnasium")
+    completed = subprocess.run(
+        [sys.executable, BENCHMARKS / "gym_steps.py", "--settings", "lane", "--repetitions", "1", "--limit-s", "2"],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=900,
+    )
+    result = json.loads(completed.stdout.splitlines()[-1])
+    assert result["lane"]["steps_per_s"] > 0
+    assert result["lane"]["ratio"] > 0
+    assert "times the time of a plain drive" in completed.stdout
+
+
 def test_a_growth_onset_that_was_not_found_is_a_dash() -> None:
     """A case without an onset, by theory or measured, has a dash in its table row."""
     assert table_row(1.3, 15.0, 6.0, 461.9, None) == "| 1.3 s | 15 Hz | 6 m/s | 461.9 ms | – | – |"

@@ -1,0 +1,47 @@
+"""Checks of the environment's parameters; each error is a sentence that says what to write."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from lavt.errors import UserError
+
+
+def is_number(value: Any, least: float = -math.inf) -> bool:
+    """Return whether a value is a finite number, not a truth value, and at least `least`."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and least <= value < math.inf
+
+
+def check_positive(name: str, value: Any) -> None:
+    """Raise `UserError` unless the value is a finite number above 0."""
+    if not is_number(value, 0.0) or value == 0:
+        raise UserError(f"{name} must be a finite number above 0, not {value!r}")
+
+
+def check_count(name: str, value: Any, most: int) -> None:
+    """Raise `UserError` unless the value is a whole number from 0 to `most`."""
+    if not isinstance(value, int) or not is_number(value, 0) or value > most:
+        raise UserError(f"{name} must be a whole number from 0 to {most}, not {value!r}")
+
+
+def parse_names(option: str, names: Any, default: str) -> tuple[str, ...]:
+    """Return the names in a name or a list of names; `default` for None."""
+    if names is None:
+        return (default,)
+    result = (names,) if isinstance(names, str) else tuple(names) if isinstance(names, list | tuple) else ()
+    if not result or not all(isinstance(name, str) for name in result):
+        raise UserError(f"{option} must be a name or a list of names, not {names!r}")
+    return result
+
+
+def parse_range_ms(option: str, delay: Any) -> tuple[float, float] | None:
+    """Return the smallest and the largest delay in a delay or a pair of delays, in ms; None for None."""
+    if delay is None:
+        return None
+    limits = tuple(delay) if isinstance(delay, list | tuple) else (delay, delay)
+    if len(limits) != 2 or not all(is_number(limit, 0.0) for limit in limits) or limits[0] > limits[1]:
+        raise UserError(
+            f"{option} must be a delay in ms, or the smallest and the largest delay, such as (0, 300), not {delay!r}"
+        )
+    return float(limits[0]), float(limits[1])
