@@ -99,6 +99,7 @@ CHANNELS: dict[str, Channel] = {
     "video": Channel("record", "camera"),
     "admission": Channel("record", "actuator"),
     "wheel": Channel("record", "actuator"),
+    "speed_limit": Channel("record", "actuator"),
     "truth": Channel("record", "actuator"),
     "route": Channel("record", "actuator"),
     "event": Channel("record", "actuator"),

@@ -162,7 +162,8 @@ def _with_tuples(kind: type[BaseModel], data: Mapping[str, Any]) -> dict[str, An
         if isinstance(value, dict) and isinstance(annotation, type) and issubclass(annotation, BaseModel):
             converted[name] = _with_tuples(annotation, value)
         elif isinstance(value, list) and typing.get_origin(annotation) is tuple:
-            converted[name] = tuple(value)
+            are_lists = typing.get_origin(typing.get_args(annotation)[0]) is tuple
+            converted[name] = tuple(tuple(part) if are_lists and isinstance(part, list) else part for part in value)
     return converted
 
 

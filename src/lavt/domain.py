@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
 
 if TYPE_CHECKING:
     import numpy as np
@@ -194,6 +194,8 @@ Mode = Literal["arm", "drive", "stop"]
 Operation = Literal["acquire", "request_handover", "release", "emergency_stop", "clear_emergency_stop"]
 """acquire, release: control of the vehicle. request_handover: ask the active operator to release control."""
 SafetyState = Literal["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]
+SpeedLimitReason = Literal["speed", "stopping distance", "sight", "latency", "delay margin", "no picture", "recovery"]
+"""Why the vehicle limits its speed; `SPEED_LIMIT_REASONS` (`safety/speed_limit.py`) has the meanings."""
 
 
 class Command(Struct, frozen=True):
@@ -242,6 +244,9 @@ class State(Struct, frozen=True):
     """Name of the client that requests a handover; empty: no client requests one."""
     instance: int = 0
     """Random number of the server process."""
+    speed_limit_mps: float | UnsetType = UNSET
+    """The speed above which the vehicle brakes; unset: it has no speed governor, or is not driven."""
+    speed_limit_reason: SpeedLimitReason | UnsetType = UNSET
 
 
 class SessionRequest(Struct, frozen=True):

@@ -21,7 +21,7 @@ from lavt.control.drive_controller import DriveController, make_controller
 from lavt.control.human_controls import HUMAN_LIMITS, HumanControls
 from lavt.control.prediction import CarModel
 from lavt.control.two_point import TWO_POINT, TwoPointDriver, TwoPointSettings
-from lavt.domain import NS_PER_MS, Now
+from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.node import Node
 from lavt.nodes.actuator import ActuatorNode
@@ -38,6 +38,7 @@ from lavt.nodes.payloads import DelayChoice, Route
 from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.receiver import ReceiverNode
 from lavt.safety.gate import SafetyGate
+from lavt.safety.governor import Governor, GovernorSettings
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS, Limits
 from lavt.transport.rtp.fec import RepairSender
@@ -162,6 +163,27 @@ def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
     return limits
 
 
+def build_governor(config: SafetyConfig) -> Governor | None:
+    """Build the speed governor; None: the config does not enable it."""
+    settings = config.governor
+    if not settings.enabled:
+        return None
+    governed = GovernorSettings(
+        nominal_mps=config.speed_limit_mps if settings.nominal_mps is None else settings.nominal_mps,
+        latency_limit_ns=round(settings.latency_limit_ms * NS_PER_MS),
+        sight_m=settings.sight_m,
+        braking_mps2=settings.braking_mps2,
+        brake_delay_ns=round(settings.brake_delay_ms * NS_PER_MS),
+        reaction_ns=round(settings.reaction_ms * NS_PER_MS),
+        delay_margin=tuple((mps, round(delay_ms * NS_PER_MS)) for mps, delay_ms in settings.delay_margin),
+        window_ns=round(settings.window_s * NS_PER_S),
+        tail=settings.tail,
+        rise_mps2=settings.rise_mps2,
+        hysteresis_mps=settings.hysteresis_mps,
+    )
+    return Governor(governed, config.speed_limit_mps)
+
+
 def build_server(
     config: ServerConfig,
     now: Callable[[], Now],
@@ -243,6 +265,7 @@ def build_actuator(
         video_port=video_port,
         instance=entropy.number(64),
         only_operator=config.experiment.operator,
+        governor=build_governor(config.safety),
     )
     return ActuatorNode(
         vehicle,

@@ -20,6 +20,7 @@ from lavt.config.controller import TwoPointConfig as TwoPointConfig
 from lavt.config.costs import Costs as Costs
 from lavt.config.dbw import DbwConfig as DbwConfig
 from lavt.config.experiment import ExperimentConfig as ExperimentConfig
+from lavt.config.governor import GovernorConfig as GovernorConfig
 from lavt.config.injection import ClientInjectionConfig as ClientInjectionConfig
 from lavt.config.injection import Condition as Condition
 from lavt.config.injection import FlowChanges as FlowChanges

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from lavt.config.carla import CarlaConfig
 from lavt.config.dbw import DbwConfig
+from lavt.config.governor import GovernorConfig
 from lavt.config.section import Section
 
 MAX_SIMULATED_MPS: Final = 22.3
@@ -74,3 +75,5 @@ class SafetyConfig(Section):
     """The distance in which the car must be able to stop; above 20 m, the car can drive faster than it was tested."""
     speed_limit_mps: float = Field(40 / 3.6, gt=0, le=MAX_SIMULATED_MPS)
     """Above this speed the vehicle allows no throttle."""
+    governor: GovernorConfig = GovernorConfig()
+    """The speed governor (`docs/governor.md`). It only lowers limits, so every vehicle can have any of its values."""

@@ -6,12 +6,12 @@ from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
-from msgspec import Struct
+from msgspec import UNSET, Struct
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Command, Ending, Now, Pose, SessionRequest, State, VehicleEvent
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Message, Send, Stage
-from lavt.nodes.payloads import Admission, AtWheel, Event, FrameWritten, Route, StationaryStatus
+from lavt.nodes.payloads import Admission, AtWheel, Event, FrameWritten, Route, SpeedLimitSample, StationaryStatus
 from lavt.safety.gate import CommandVerdict, SafetyGate
 from lavt.transport.messages import decode, encode
 from lavt.vehicle.camera import FrameTimes
@@ -250,6 +250,7 @@ class ActuatorNode:
         if is_state_due:
             self._publish_ns += STATE_PERIOD_NS * (1 + (now.mono_ns - self._publish_ns) // STATE_PERIOD_NS)
             sends.append(Send("state", encode(self._state(now))))
+            sends += self._report_speed_limit(now)
             status = StationaryStatus(
                 self.gate.machine.is_at_rest(self.vehicle.state()), self.gate.session.active_operator
             )
@@ -267,6 +268,7 @@ class ActuatorNode:
         vehicle = self.vehicle.state()
         session = self.gate.session
         active_operator, active_operator_instance = session.active_operator or ("", 0)
+        speed_limit = self.gate.watchdog.speed_limit
         return State(
             sent_wall_ns=now.wall_ns,
             state_mono_ns=vehicle.mono_ns,
@@ -282,7 +284,18 @@ class ActuatorNode:
             active_operator_instance=active_operator_instance,
             requested_by=session.takeover_requests.requested_by(now.mono_ns),
             instance=self.gate.instance,
+            speed_limit_mps=UNSET if speed_limit is None else speed_limit.mps,
+            speed_limit_reason=UNSET if speed_limit is None else speed_limit.reason,
         )
+
+    def _report_speed_limit(self, now: Now) -> list[Send]:
+        """Return a record entry of the present limit of the speed, if there is a speed governor and it is in force."""
+        governor, speed_limit = self.gate.governor, self.gate.watchdog.speed_limit
+        if governor is None or speed_limit is None:
+            return []
+        age_s = governor.age_s(now.mono_ns)
+        age_ms = None if age_s is None else age_s * 1000
+        return [Send("speed_limit", SpeedLimitSample(now.mono_ns, speed_limit.mps, speed_limit.reason, age_ms))]
 
     def _report_reached_commands(self) -> list[Send]:
         """Return a record entry for each command that has reached the wheels according to the vehicle's reports."""

@@ -98,6 +98,17 @@ class Admission(Struct, frozen=True):
     brake: float
 
 
+class SpeedLimitSample(Struct, frozen=True):
+    """The limit of the speed while the vehicle has a speed governor and is driven."""
+
+    mono_ns: int
+    limit_mps: float
+    reason: str
+    """`SpeedLimitReason`."""
+    age_ms: float | None
+    """The picture age that the speed governor's limit is for; None: unknown."""
+
+
 class AtWheel(Struct, frozen=True):
     """A command that reached the wheels; times are on the server's monotonic clock."""
 

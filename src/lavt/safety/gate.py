@@ -13,6 +13,7 @@ from enum import StrEnum
 from msgspec import Struct
 
 from lavt.domain import Command, SafetyState, VehicleState
+from lavt.safety.governor import Governor
 from lavt.safety.issued_stamps import IssuedStamps
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import Limits
@@ -78,8 +79,11 @@ class SafetyGate:
         video_port: int = 0,
         instance: int = 0,
         only_operator: str = "",
+        governor: Governor | None = None,
     ) -> None:
         self.limiter = limiter
+        self.governor = governor
+        """The speed governor; None: the vehicle has none."""
         self.instance = instance
         self.counts: Counter[str] = Counter()
         self.last_rejection = ""
@@ -97,7 +101,7 @@ class SafetyGate:
             video_port=video_port,
             only_operator=only_operator,
         )
-        self.watchdog = Watchdog(limits, limiter, self.machine, self.epoch, self.issued_stamps)
+        self.watchdog = Watchdog(limits, limiter, self.machine, self.epoch, self.issued_stamps, governor=governor)
         self._limits = limits
         self._newest_frame = -1
         self._arming_since_ns = 0
@@ -137,6 +141,8 @@ class SafetyGate:
             self.watchdog.set_command(command, vehicle)
             if is_fresh:
                 self.machine.trigger("fresh command")
+        if self.governor is not None:
+            self.governor.note_age(now_ns - self.issued_stamps.captured_ns(command.stamp_ns), now_ns)
         return ACCEPTED
 
     def rejection_reason(self, command: Command, vehicle: VehicleState, now_ns: int) -> RejectionReason | None:
@@ -187,7 +193,11 @@ class SafetyGate:
         elif self.machine.state != "arming":
             self._arming_since_ns = now_ns
             self.watchdog.start_at_rest(vehicle, now_ns)  # engaging the vehicle must not turn its wheel
+            if self.governor is not None:
+                self.governor.begin_arming()
             self.machine.trigger("arming begins")
         elif vehicle.is_engaged and now_ns - self._arming_since_ns >= self._limits.arming_hold_ns:
             self.watchdog.start_at_rest(vehicle, now_ns)
+            if self.governor is not None:
+                self.governor.begin_drive(now_ns)
             self.machine.trigger("arming complete")

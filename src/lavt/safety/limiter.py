@@ -8,6 +8,7 @@ from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.domain import MAX_REPORTED_MPS, NS_PER_S, Actuation, VehicleState
 from lavt.errors import UserError
 from lavt.safety.limits import Limits
+from lavt.safety.speed_limit import SpeedLimit
 
 COMMAND_PERIOD_S = CLIENT_LIMITS.command_period_ns / NS_PER_S
 """A steering change that the rate limit allows in this time is not reported as limited."""
@@ -57,11 +58,17 @@ class Limiter:
         return vehicle.steering_rad if math.isfinite(vehicle.steering_rad) else 0.0
 
     def limit(
-        self, requested: Actuation, vehicle: VehicleState, now_ns: int, picture_age_ns: int | None = None
+        self,
+        requested: Actuation,
+        vehicle: VehicleState,
+        now_ns: int,
+        picture_age_ns: int | None = None,
+        governed: SpeedLimit | None = None,
     ) -> Actuation:
         """Return `requested` within the limits at the vehicle's present speed; all values are finite.
 
-        `picture_age_ns` is the age of the picture from which `requested` was made; None without a picture.
+        `picture_age_ns` is the age of the picture from which `requested` was made; None without a picture. `governed`
+        is the limit of the speed governor, if the vehicle has one.
         """
         before_rad = self.target_rad(vehicle)
         step_rad = self.limits.steering_rate_radps * max(0, now_ns - self._at_ns) / NS_PER_S
@@ -91,10 +98,13 @@ class Limiter:
             throttle = 0.0
             changed.append("speed")
         brake = requested.brake
+        if governed is not None and is_speed_known:
+            pedals = self._governed_pedals(throttle, brake, governed.mps - abs(vehicle.speed_mps))
+            if pedals != (throttle, brake):
+                throttle, brake = pedals
+                changed.append(governed.reason)
         if picture_age_ns is not None and is_speed_known:
-            picture_age_s = picture_age_ns / NS_PER_S
-            limit_mps = stopping_speed_limit_mps(picture_age_s, self.limits, self._max_acceleration_mps2)
-            excess_mps = abs(vehicle.speed_mps) - limit_mps
+            excess_mps = abs(vehicle.speed_mps) - self.stopping_limit(picture_age_ns).mps
             minimum_brake = self._stopping_distance_brake(excess_mps)
             if excess_mps > 0 and (throttle > 0 or brake < minimum_brake):
                 throttle, brake = 0.0, max(brake, minimum_brake)
@@ -104,6 +114,25 @@ class Limiter:
         self._steering_rad, self._at_ns = target_rad, max(now_ns, self._at_ns)
         self.applied_limits = tuple(changed)
         return Actuation(target_rad, throttle, brake)
+
+    def stopping_limit(self, picture_age_ns: int) -> SpeedLimit:
+        """Return the speed limit of the stopping distance, for a command from a picture of this age."""
+        age_s = picture_age_ns / NS_PER_S
+        return SpeedLimit(
+            stopping_speed_limit_mps(age_s, self.limits, self._max_acceleration_mps2), "stopping distance"
+        )
+
+    def _governed_pedals(self, throttle: float, brake: float, below_mps: float) -> tuple[float, float]:
+        """Return throttle and brake with which the speed approaches a limit that it is below by `below_mps`.
+
+        The acceleration is at most the one with which the speed is at the limit after the settling time. Above the
+        limit, it is a deceleration of at most `governor_deceleration_mps2`.
+        """
+        acceleration_mps2 = below_mps / self.limits.stopping_brake_settling_s
+        if acceleration_mps2 >= 0:
+            return min(throttle, acceleration_mps2 / self._max_acceleration_mps2), brake
+        deceleration_mps2 = min(-acceleration_mps2, self.limits.governor_deceleration_mps2)
+        return 0.0, max(brake, min(1.0, deceleration_mps2 / self.max_braking_mps2))
 
     def _stopping_distance_brake(self, excess_mps: float) -> float:
         """Return the pedal that removes the excess speed in the settling time, at most the pedal of a safe stop."""

@@ -42,6 +42,9 @@ class Limits:
     stopping_brake_settling_s: float = 0.25
     """Time in which the brake removes speed above `stopping_speed_limit_mps`. With a shorter time the speed would
     oscillate, because the brake's lag is 0.2 s. With an excess of 1 m/s or more, the brake is that of a safe stop."""
+    governor_deceleration_mps2: float = 2.0
+    """The largest deceleration with which the vehicle slows down to a lower limit of the speed governor. It is that of
+    an ordinary brake application, because such a limit falls while commands still arrive."""
     picture_age_limit_ns: int = 500 * NS_PER_MS
     """A command from an older picture is rejected. The age is the time between the capture (the stamp, if the camera
     reports no capture time) and the application of the command. For a simulated vehicle the config can set up to

@@ -19,6 +19,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.safety.gate import RejectionReason
 from lavt.safety.limits import LIMITS
+from lavt.safety.speed_limit import SPEED_LIMIT_REASONS
 from lavt.safety.state_machine import TRANSITIONS, TRIGGER_MESSAGES, Trigger
 
 _BLOCK: Final = re.compile(r"<!-- drawn: (?P<name>[a-z ]+) -->\n(?P<drawn>.*?)<!-- drawn until here -->", re.DOTALL)
@@ -84,11 +85,17 @@ def draw_rejections() -> str:
     return "\n".join(f"{number}. {reason}" for number, reason in enumerate(RejectionReason, 1))
 
 
+def draw_speed_limits() -> str:
+    """Return the table of the reasons for which the vehicle limits its speed."""
+    return _table(("reason", "meaning"), [(f"`{reason}`", text) for reason, text in SPEED_LIMIT_REASONS.items()])
+
+
 GENERATED_BLOCKS: Final[dict[str, Callable[[], str]]] = {
     "states": draw_states,
     "transitions": draw_transitions,
     "limits of the vehicle": draw_vehicle_limits,
     "limits of the client": draw_client_limits,
+    "reasons of the speed limit": draw_speed_limits,
     "rejections": draw_rejections,
 }
 """For each block, the function that generates it."""

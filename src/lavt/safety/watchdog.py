@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from lavt.domain import Actuation, Command, VehicleState
+from lavt.safety.governor import Governor
 from lavt.safety.issued_stamps import IssuedStamps
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import Limits
 from lavt.safety.path_follower import PathFollower
 from lavt.safety.session import CommandEpoch
+from lavt.safety.speed_limit import SpeedLimit, lowest
 from lavt.safety.state_machine import UNCOMMANDED, SafetyStateMachine
 from lavt.safety.stop_brake import StopBrake
 
@@ -26,7 +28,13 @@ class Watchdog:
         machine: SafetyStateMachine,
         epoch: CommandEpoch,
         issued_stamps: IssuedStamps,
+        *,
+        governor: Governor | None = None,
     ) -> None:
+        self.speed_limit: SpeedLimit | None = None
+        """The lowest limit of the speed at the last actuation; None without a governor, or if no command was in
+        force."""
+        self._governor = governor
         self._limits = limits
         self._limiter = limiter
         self._machine = machine
@@ -125,7 +133,11 @@ class Watchdog:
             self._stop_brake.reset()
         picture_age_ns = now_ns - self._captured_ns if command else None
         target = Actuation(self._steering_target_rad(vehicle, now_ns), throttle, brake)
-        return self._limiter.limit(target, vehicle, now_ns, picture_age_ns)
+        governed = self.speed_limit = None
+        if self._governor is not None and picture_age_ns is not None:
+            governed = self._governor.limit(now_ns)
+            self.speed_limit = lowest(governed, self._limiter.stopping_limit(picture_age_ns))
+        return self._limiter.limit(target, vehicle, now_ns, picture_age_ns, governed)
 
     def _steering_target_rad(self, vehicle: VehicleState, now_ns: int) -> float:
         """Return the commanded angle. In states without commands, return the angle that follows the last path.

@@ -16,7 +16,7 @@ from types import GenericAlias
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta
 
 from lavt.domain import (
     MAX_REPORTED_MPS,
@@ -35,12 +35,13 @@ from lavt.domain import (
     SafetyState,
     SessionReply,
     SessionRequest,
+    SpeedLimitReason,
     State,
     VehicleInfo,
 )
 from lavt.errors import BadMessage
 
-VERSION = 4
+VERSION = 5
 MAX_MESSAGE_BYTES = 1024
 RECORD_PART_BYTES = 32_768
 """The longest part of a record in a `RunReply`."""
@@ -60,6 +61,7 @@ U64 = Annotated[int, Meta(ge=0)]
 """An epoch, or the instance of a process. The type has no upper bound, because msgpack has no larger integers."""
 U63 = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 """Times, and numbers that grow, such as that of an emergency stop: the non-negative signed 64-bit integers."""
+SpeedLimit = Annotated[float, Meta(ge=0.0, le=MAX_REPORTED_MPS)]
 Speed = Annotated[float, Meta(ge=-MAX_REPORTED_MPS, le=MAX_REPORTED_MPS)]
 RoadWheel = Annotated[float, Meta(ge=-MAX_ROAD_WHEEL_RAD, le=MAX_ROAD_WHEEL_RAD)]
 Curvature = Annotated[float, Meta(ge=-CURVATURE_BOUND_PER_M, le=CURVATURE_BOUND_PER_M)]
@@ -121,6 +123,8 @@ TYPES: dict[type, dict[str, Any]] = {
         "active_operator_instance": U64,
         "requested_by": NameOrEmpty,
         "instance": U64,
+        "speed_limit_mps": SpeedLimit | None,
+        "speed_limit_reason": SpeedLimitReason | None,
     },
     SessionRequest: {"operation": Operation, "who": Name, "instance": U64, "number": U63},
     SessionReply: {
@@ -179,7 +183,10 @@ TYPES: dict[type, dict[str, Any]] = {
         "data": Annotated[bytes, Meta(max_length=RECORD_PART_BYTES)],
     },
 }
-"""The fields of each message in the order on the wire, with types and ranges. NaN is in no range."""
+"""The fields of each message in the order on the wire, with types and ranges. NaN is in no range.
+
+`None` (nil on the wire) stands for a field that is unset.
+"""
 
 CHECKS: dict[type, dict[str, Callable[[Any], bool]]] = {
     SessionReply: {"token": lambda token: len(token) in {0, 16}},
@@ -224,7 +231,8 @@ def encode(message: Message) -> bytes:
     limited |= {name: _bounded(getattr(message, name), bound) for name, bound in BOUNDS.get(kind, {}).items()}
     if limited:
         message = msgspec.structs.replace(message, **limited)
-    return _ENCODER.encode((VERSION, *_FIELD_VALUES[kind](message)))
+    values = _FIELD_VALUES[kind](message)
+    return _ENCODER.encode((VERSION, *(None if value is UNSET else value for value in values)))
 
 
 def _cut(text: str, max_bytes: int) -> str:
@@ -271,7 +279,7 @@ def _decode(kind: type[Any], data: bytes) -> Any:
         _, *values = _DECODERS[kind].decode(data)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise BadMessage(_describe(kind, str(error))) from error
-    message = kind(*values)
+    message = kind(*(UNSET if value is None else value for value in values))
     for name, is_valid in CHECKS.get(kind, {}).items():
         if not is_valid(getattr(message, name)):
             raise BadMessage(f"{kind.__name__}.{name} is out of range")
