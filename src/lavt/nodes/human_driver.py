@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 from lavt.control.client_limits import ClientLimits
 from lavt.control.human_controls import LOST, HumanControls, HumanInput
@@ -17,7 +17,7 @@ from lavt.errors import BadMessage
 from lavt.node import WAKE, Message, Peer, Send, Stage
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.commander import Commander, stopping
-from lavt.nodes.page_figures import BitRate, RoundTrip
+from lavt.nodes.page_figures import BitRate, RoundTrip, vehicle_figures
 from lavt.nodes.page_prediction import PagePredictor
 from lavt.nodes.page_video import PageVideo
 from lavt.nodes.payloads import (
@@ -346,10 +346,6 @@ class HumanDriverNode(Commander):
         state, session, view = self._newest_state, self.session, self._view
         last, shows, round_trip_ns = self._last, self._shows_latency, self._round_trip.newest_ns
         is_current = last is not None and now.mono_ns - last[0] < IDLE_COMMAND_NS
-        vehicle: dict[str, Any] = {
-            name: getattr(state, name, "")
-            for name in ("safety", "reason", "active_operator", "requested_by", "rejected", "limited")
-        }
         stop = "none" if not session.emergency_stop else "confirmed" if session.is_stop_confirmed else "sent"
         return PageStatus(
             sent_us=now.mono_ns // NS_PER_US,
@@ -372,5 +368,5 @@ class HumanDriverNode(Commander):
             lost_share=None if self._reception is None or not shows else self._reception.lost_share,
             delay=None if self._delay is None else (self._delay.video_ms, self._delay.control_ms),
             conditions=self._conditions,
-            **vehicle,
+            **vehicle_figures(state, shows_latency=shows),
         )

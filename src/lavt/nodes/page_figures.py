@@ -1,11 +1,13 @@
-"""Figures that a page shows about the running drive: bit rate and round trip of the commands."""
+"""Figures that a page shows about the running drive: bit rate, round trip of the commands, state of the vehicle."""
 
 from __future__ import annotations
 
 from collections import deque
-from typing import Final
+from typing import Any, Final
 
-from lavt.domain import NS_PER_S
+from msgspec import UNSET
+
+from lavt.domain import NS_PER_S, State
 
 MAX_UNITS: Final = 300
 """How many access units are remembered for the bit rate: more than a second at any frame rate."""
@@ -50,3 +52,16 @@ class RoundTrip:
             oldest, sent_ns = self._sent.popleft()
             if oldest == sequence:
                 self.newest_ns = now_ns - sent_ns
+
+
+def vehicle_figures(state: State | None, *, shows_latency: bool) -> dict[str, Any]:
+    """Return the fields of a `PageStatus` that are those of the vehicle's newest state; None: there is no state yet.
+
+    Without `shows_latency`, the reason of the speed limit is left out, because it can be the latency.
+    """
+    names = ("safety", "reason", "active_operator", "requested_by", "rejected", "limited")
+    figures: dict[str, Any] = {name: getattr(state, name, "") for name in names}
+    if state is not None and state.speed_limit_mps is not UNSET and state.speed_limit_reason is not UNSET:
+        figures["speed_limit_mps"] = state.speed_limit_mps
+        figures["speed_limit_reason"] = state.speed_limit_reason if shows_latency else ""
+    return figures

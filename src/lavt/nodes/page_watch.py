@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_US, Command, FloatArray, Lane, Now, State
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Message, Peer, Send, Stage
-from lavt.nodes.page_figures import BitRate, RoundTrip
+from lavt.nodes.page_figures import BitRate, RoundTrip, vehicle_figures
 from lavt.nodes.page_video import PageVideo
 from lavt.nodes.payloads import LaneSeen, PictureRead, ReceivedUnit
 from lavt.perception.calibration import CalibratedCamera, picture_points
@@ -194,10 +194,6 @@ class PageWatchNode:
 
     def _status(self, now: Now) -> PageStatus:
         state, command, round_trip_ns = self._state, self._command, self._round_trip.newest_ns
-        vehicle: dict[str, Any] = {
-            name: getattr(state, name, "")
-            for name in ("safety", "reason", "active_operator", "requested_by", "rejected", "limited")
-        }
         return PageStatus(
             sent_us=now.mono_ns // NS_PER_US,
             role="watches",
@@ -218,7 +214,7 @@ class PageWatchNode:
             lost_share=None if self._reception is None else self._reception.lost_share,
             delay=None,
             controller=self._controller,
-            **vehicle,
+            **vehicle_figures(state, shows_latency=True),
         )
 
 

@@ -192,6 +192,10 @@ class PageStatus(Struct, frozen=True, kw_only=True):
     """The injected delays of video and control in ms; None: this client cannot inject any."""
     conditions: tuple[tuple[str, float, float], ...] = ()
     """Name and delays of the conditions to choose from."""
+    speed_limit_mps: float | None = None
+    """The speed above which the vehicle brakes; None: it has no speed governor, or is not driven."""
+    speed_limit_reason: str = ""
+    """`SpeedLimitReason`; empty: none, or the page shows no latency."""
     controller: str = ""
     """The controller that drives; then the pages can command nothing. Empty: a person drives."""
 

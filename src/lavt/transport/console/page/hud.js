@@ -28,7 +28,7 @@ export function showClosed(text, stop = "") {
   byId("stop").className = "";
   const warnings = { "": text, pending: `${STOP_NOT_SENT} ${STOP_SENT_LATER}`, lost: `${STOP_NOT_SENT} ${text}` };
   byId("hint").textContent = warnings[stop];
-  byId("take").hidden = byId("release").hidden = true;
+  byId("take").hidden = byId("release").hidden = byId("speed_limit").hidden = true;
   markOld(true);
 }
 
@@ -74,6 +74,7 @@ export function showStatus(status, input, video, age_ms, isStopPending, notice) 
   const [speed, target] = [byId("speed").querySelector("b"), byId("speed").querySelector("i")];
   speed.textContent = status.speed_mps === null ? "–" : (status.speed_mps * 3.6).toFixed(0);
   target.textContent = (status.target_mps * 3.6).toFixed(0);
+  showSpeedLimit(status);
   byId("steering").value = -input.steering; // to the right on the screen is to the right
   byId("throttle").value = input.throttle;
   byId("brake").value = input.brake;
@@ -88,6 +89,13 @@ export function showStatus(status, input, video, age_ms, isStopPending, notice) 
   history.add(age_ms);
   byId("stop").className = isPast(status) ? "" : status.emergency_stop;
   showNetwork(status);
+}
+
+// The speed above which the vehicle brakes, rounded down, and why. A vehicle without a speed governor reports none.
+function showSpeedLimit({ speed_limit_mps, speed_limit_reason }) {
+  byId("speed_limit").hidden = speed_limit_mps === null;
+  const reason = speed_limit_reason && `: ${speed_limit_reason}`;
+  byId("speed_limit").textContent = `at most ${Math.floor(speed_limit_mps * 3.6)} km/h${reason}`;
 }
 
 // The vehicle has executed an emergency stop of this client, but is in another state now.
