@@ -42,6 +42,7 @@ from lavt.nodes.payloads import (
     PictureRead,
     RelayDelay,
     Route,
+    SpeedLimitSample,
 )
 from lavt.runtime.pipeline import Timeline
 from lavt.runtime.recorder import UNRECORDED, Packet
@@ -64,6 +65,7 @@ PAYLOADS: dict[str, type[Struct]] = {
     "picture": PictureRead,
     "admission": Admission,
     "wheel": AtWheel,
+    "speed_limit": SpeedLimitSample,
     "truth": GroundTruth,
     "route": Route,
     "event": Event,

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, Command, Operation, SessionReply, SessionRequest, VehicleState
 from lavt.safety.gate import CommandVerdict, SafetyGate
+from lavt.safety.governor import Governor
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS, Limits
 
@@ -42,7 +43,7 @@ def vehicle_at(speed_mps: float = 0.0, steering_rad: float = 0.0) -> VehicleStat
 class Rig:
     """A safety gate with its surroundings; `now_ns` is the server's monotonic clock, which `pass_time` advances."""
 
-    def __init__(self, limits: Limits = LIMITS, *, only_operator: str = "") -> None:
+    def __init__(self, limits: Limits = LIMITS, *, only_operator: str = "", governor: Governor | None = None) -> None:
         epochs, tokens = count(1000), count(1)
         self.gate = SafetyGate(
             limits,
@@ -52,6 +53,7 @@ class Rig:
             host="bench",
             video_port=5600,
             only_operator=only_operator,
+            governor=governor,
         )
         self.now_ns = START_NS
         self.vehicle = vehicle_at()

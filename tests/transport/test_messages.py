@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 import tracemalloc
-from typing import Any
+from typing import Any, get_args
 
 import msgpack
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import UNSET
 from msgspec.structs import replace
 
 from lavt.domain import (
@@ -18,6 +19,7 @@ from lavt.domain import (
     RunRequest,
     SessionReply,
     SessionRequest,
+    SpeedLimitReason,
     State,
     VehicleInfo,
 )
@@ -137,6 +139,8 @@ STATES = st.builds(
     active_operator_instance=U64,
     requested_by=st.one_of(st.just(""), NAMES),
     instance=U64,
+    speed_limit_mps=st.one_of(st.just(UNSET), st.floats(0, 100)),
+    speed_limit_reason=st.one_of(st.just(UNSET), st.sampled_from(get_args(SpeedLimitReason))),
 )
 REQUESTS = st.builds(
     SessionRequest,
@@ -180,6 +184,8 @@ def test_longest_texts_fit(letter: str) -> None:
         applied_sequence=2**63 - 1,
         active_operator_instance=2**64 - 1,
         instance=2**64 - 1,
+        speed_limit_mps=100.0,
+        speed_limit_reason=max(get_args(SpeedLimitReason), key=len),
     )
     assert decode(State, encode(message)) == message
     with pytest.raises(BadMessage):
@@ -248,6 +254,8 @@ NOT_A_TEXT: list[Any] = [1, 1.0, True, None, b"drive", [], {}]
 NOT_A_U63 = [*NOT_AN_INTEGER, -1, 2**63, 2**64 - 1]
 NOT_A_NAME = [*NOT_A_TEXT, "", "a/b", "**", "*", "a b", "-a", "_a", "a\n", "é", "a" * 33, "$a", "a#"]
 NOT_A_NAME_OR_EMPTY = [value for value in NOT_A_NAME if value != ""]
+NOT_A_NUMBER_OR_NIL = [value for value in NOT_A_NUMBER if value is not None]
+NOT_A_TEXT_OR_NIL = [value for value in NOT_A_TEXT if value is not None]
 POINTS = [0.0] * PATH_POINTS
 OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
     Command: {
@@ -288,6 +296,8 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "active_operator_instance": [*NOT_AN_INTEGER, -1],
         "requested_by": NOT_A_NAME_OR_EMPTY,
         "instance": [*NOT_AN_INTEGER, -1],
+        "speed_limit_mps": [*NOT_A_NUMBER_OR_NIL, 100.1, -0.1],
+        "speed_limit_reason": [*NOT_A_TEXT_OR_NIL, "", "speeding"],
     },
     SessionRequest: {
         "operation": [*NOT_A_TEXT, "", "steal"],
@@ -356,6 +366,7 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
 def pack_unchecked(message: AnyMessage, **changed: Any) -> bytes:
     """Pack a message with changed values, which may be invalid."""
     values = [changed.get(name, getattr(message, name)) for name in message.__struct_fields__]
+    values = [None if value is UNSET else value for value in values]
     packed: bytes = msgpack.packb([VERSION, *values])
     return packed
 
@@ -369,7 +380,7 @@ def test_every_field_is_checked(kind: type[Any], name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", MESSAGES)
-@pytest.mark.parametrize("version", [0, 3, 5, -1, True, 4.0, "4", None, [4]])
+@pytest.mark.parametrize("version", [0, 4, 6, -1, True, 5.0, "5", None, [5]])
 def test_other_versions(kind: type[Any], version: Any) -> None:
     """A message whose version is not exactly the expected integer is rejected."""
     _, *values = msgpack.unpackb(encode(MESSAGES[kind]))

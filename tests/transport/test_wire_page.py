@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import pytest
 from msgspec import Meta
@@ -32,6 +33,8 @@ def type_text(annotation: Any) -> str:
     texts = {bool: "boolean", bytes: f"binary, 0 or {TOKEN_BYTES} bytes", Name: "name", NameOrEmpty: "name or empty"}
     if annotation in texts:
         return texts[annotation]
+    if isinstance(annotation, UnionType) or get_origin(annotation) is Union:
+        return ", or ".join("nil" if part is NoneType else type_text(part) for part in get_args(annotation))
     if get_origin(annotation) is Literal:
         return ", ".join(f"`{value}`" for value in get_args(annotation))
     assert get_origin(annotation) is Annotated

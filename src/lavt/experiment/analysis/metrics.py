@@ -26,6 +26,7 @@ from lavt.experiment.analysis.latency import (
     received_frames_of,
     video_latency_ns,
 )
+from lavt.experiment.analysis.speed_limits import speed_limit_metrics
 from lavt.experiment.analysis.stage_latency import processing_ns, stage_percentiles
 from lavt.experiment.analysis.steering import steering_metrics
 from lavt.experiment.analysis.tracking import (
@@ -90,6 +91,7 @@ def measure(server: Record, client: Record) -> RunMeasurement:
         "completed_in_own_lane": completed_in_own_lane(ending, kept["lane_kept"]),
         **kept,
         "duration_s": (ended_ns - began_ns) / NS_PER_S if has_begun else None,
+        "speed_limits": speed_limit_metrics(server.table("speed_limit"), began_ns, ended_ns),
         **latencies,
         "delta": clocks.entry,
     }

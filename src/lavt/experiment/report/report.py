@@ -47,6 +47,7 @@ from lavt.experiment.report.sections import (
     survival_parts,
     validity_parts,
 )
+from lavt.experiment.report.speed_limit_section import speed_limit_parts
 from lavt.experiment.report.study_section import study_parts
 from lavt.experiment.statistics.participants import SCHEMA, compare_studies
 from lavt.experiment.statistics.summary import summarize
@@ -141,13 +142,18 @@ def _chapters(
         ("Clock offset between two machines", clock_parts(report)),
         ("Versions and machines", machine_parts(report, sets)),
     ]
+    every_run = [
+        ("All runs", run_parts(report)),
+        ("Lane changes", lane_change_parts(report)),
+        ("Speed limits", speed_limit_parts(report)),
+    ]
     return [
         html_page.Chapter("Results", results, is_open=True),
         html_page.Chapter("Trajectories", trajectories, is_open=True),
         html_page.Chapter("Latency", latency),
         html_page.Chapter("Statistics", statistics),
         html_page.Chapter(VALIDITY, validity),
-        html_page.Chapter("Every run", [("All runs", run_parts(report)), ("Lane changes", lane_change_parts(report))]),
+        html_page.Chapter("Every run", every_run),
     ]
 
 
