@@ -43,6 +43,7 @@ SCHEMAS: dict[str, type[Section]] = {
     "compensation_mismatch.yaml": SweepConfig,
     "costs.yaml": Costs,
     "demo.yaml": RunConfig,
+    "governor.yaml": SweepConfig,
     "loss_and_jitter.yaml": SweepConfig,
     "roads.yaml": SweepConfig,
     "paper.yaml": SweepConfig,

@@ -58,6 +58,17 @@ def test_the_page_shows_bit_rate_and_lost_packets(page: ConnectedPage) -> None:
     wait_until("a dash is shown", lambda: page.text("lost_share") == "–")
 
 
+def test_the_page_shows_the_speed_limit_of_the_vehicle(page: ConnectedPage) -> None:
+    """The page shows the speed limit, rounded down, with its reason if there is one; without a limit it shows none."""
+    page.client.changes = {"speed_limit_mps": 5.8, "speed_limit_reason": "latency"}
+    wait_until("the limit is shown", lambda: page.text("speed_limit") == "at most 20 km/h: latency")
+    assert page.tab.evaluate("document.querySelector('#speed_limit').hidden") is False
+    page.client.changes = {"speed_limit_mps": 0.0, "speed_limit_reason": ""}
+    wait_until("the limit is shown", lambda: page.text("speed_limit") == "at most 0 km/h")
+    page.client.changes = {}
+    wait_until("it is hidden", lambda: page.tab.evaluate("document.querySelector('#speed_limit').hidden") is True)
+
+
 def test_no_input_waits_behind_others(page: ConnectedPage) -> None:
     """While the client sends nothing, the page sends no inputs and shows no old state; a stop is sent."""
     page.client.is_silent = True

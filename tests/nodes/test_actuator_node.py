@@ -10,14 +10,17 @@ from typing import Any, Literal
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from msgspec import UNSET
 from msgspec.structs import replace
 from tests.nodes.stand_ins import MONO_NS, FakeVehicle, at, deliver, payloads
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Command, EventKind, SessionReply, SessionRequest, State, VehicleEvent
 from lavt.node import WAKE, Send
 from lavt.nodes.actuator import POSE_AHEAD_NS, ActuatorNode
-from lavt.nodes.payloads import Admission, AtWheel, FrameWritten, Route
+from lavt.nodes.payloads import Admission, AtWheel, FrameWritten, Route, SpeedLimitSample
+from lavt.recording.json_payload import to_json
 from lavt.safety.gate import RejectionReason, SafetyGate
+from lavt.safety.governor import Governor, GovernorSettings
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
 from lavt.safety.state_machine import TRIGGER_MESSAGES
@@ -51,13 +54,16 @@ class Bench:
         route: Route | None = None,
         sample_times: Sequence[FrameTimes] = (),
         after_collision: Literal["end", "continue"] = "end",
+        governor: Governor | None = None,
     ) -> None:
         numbers = count(1)
         limiter = Limiter(
             LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_acceleration_mps2=2.0, max_braking_mps2=6.0
         )
         self.vehicle = FakeVehicle()
-        self.gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
+        self.gate = SafetyGate(
+            LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16), governor=governor
+        )
         self.node = ActuatorNode(
             self.vehicle,
             self.gate,
@@ -443,3 +449,32 @@ def test_commands_that_reached_the_wheels_are_recorded() -> None:
     bench.vehicle.reached = [ReachedCommand(third.applied_mono_ns or 0, reached_ns)] * 2
     reported = payloads(bench.advance(PERIOD_NS), "wheel")
     assert reported == [AtWheel(third.sequence, third.stamp_ns, third.applied_mono_ns or 0, reached_ns)]
+
+
+def test_the_speed_limit_is_published_and_recorded_while_the_vehicle_is_driven() -> None:
+    """State and record have the speed limit with its reason from the first drive command until the safe stop."""
+    bench = Bench(governor=Governor(GovernorSettings(LIMITS.speed_limit_mps), LIMITS.speed_limit_mps)).arm()
+    armed = bench.advance(PERIOD_NS)
+    assert {state.speed_limit_mps for state in states(armed)} == {UNSET}
+    assert payloads(armed, "speed_limit") == []
+    bench.send_drive_command()
+    driven = bench.advance(250 * NS_PER_MS)
+    samples: list[SpeedLimitSample] = payloads(driven, "speed_limit")
+    assert [sample.reason for sample in samples[:9]] == ["stopping distance"] * 9
+    assert samples[-1].reason == "latency"
+    assert samples[-1].age_ms is not None
+    assert samples[-1].limit_mps == pytest.approx(LIMITS.speed_limit_mps * 200 / samples[-1].age_ms)
+    published = [(state.speed_limit_mps, state.speed_limit_reason) for state in states(driven)]
+    assert published == [(sample.limit_mps, sample.reason) for sample in samples]
+    stopped = bench.advance(NS_PER_S)
+    assert states(stopped)[-1].safety == "safe_stop"
+    assert states(stopped)[-1].speed_limit_reason is UNSET
+
+
+def test_without_a_governor_states_and_records_have_no_speed_limit() -> None:
+    """Without a speed governor nothing is recorded, and the JSON of a state in the record is the same as before."""
+    bench = Bench().arm()
+    bench.send_drive_command()
+    sends = bench.advance(100 * NS_PER_MS)
+    assert payloads(sends, "speed_limit") == []
+    assert b"speed_limit" not in to_json(states(sends)[-1])

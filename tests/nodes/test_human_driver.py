@@ -388,6 +388,16 @@ def test_the_status_has_state_delays_and_round_trip() -> None:
     assert status["delay"] == [0.0, 0.0]
 
 
+@pytest.mark.parametrize(("shows_latency", "reason"), [(True, "latency"), (False, "")])
+def test_the_status_has_the_speed_limit_of_the_vehicle(*, shows_latency: bool, reason: str) -> None:
+    """A person sees the speed limit of the vehicle; its reason is hidden with the latencies."""
+    bench = HumanBench(shows_latency=shows_latency).drive()
+    mono_ns = at(bench.mono_ns).mono_ns
+    state = State(1, mono_ns, 4.0, 0.0, "drive", "driving", "why", -1, "", "", "", 0, "", 0, 4.5, "latency")
+    bench.deliver("state", encode(state))
+    assert (bench.status()["speed_limit_mps"], bench.status()["speed_limit_reason"]) == (4.5, reason)
+
+
 def test_the_status_has_the_share_of_lost_packets() -> None:
     """The share is of the packets that were due in the newest sample; it is null at first, and if none was due."""
     bench = HumanBench()

@@ -166,6 +166,16 @@ def test_the_status_tells_what_the_vehicle_does() -> None:
     assert status["state_age_ms"] == 50.0
 
 
+def test_the_status_has_the_speed_limit_of_a_governed_vehicle() -> None:
+    """The speed limit with its reason is shown; it is null if the vehicle reports none."""
+    bench = WatchBench()
+    bench.state(applied=5)
+    assert (bench.status()["speed_limit_mps"], bench.status()["speed_limit_reason"]) == (None, "")
+    state = State(1, 1, 5.0, 0.1, "drive", "driving", "why", 5, "", speed_limit_mps=4.5, speed_limit_reason="latency")
+    bench.deliver("state", encode(state))
+    assert (bench.status()["speed_limit_mps"], bench.status()["speed_limit_reason"]) == (4.5, "latency")
+
+
 def test_a_command_of_another_client_is_not_timed() -> None:
     """While another client has control, the sequence numbers that the vehicle applies are not this client's."""
     bench = WatchBench()

@@ -41,8 +41,8 @@ NOW_NS = 199 * PERIOD_NS
 """The time at which the governor of `governed` begins its drive."""
 
 
-def formula_mps(age_s: float, settings: GovernorSettings) -> float:
-    """Return the limit of an age by the formulas of docs/governor.md, each solved in another way than in the code."""
+def formula_mps(age_s: float, tail_s: float, settings: GovernorSettings) -> float:
+    """Return the limit of two ages by the formulas of docs/governor.md, each solved in another way than in the code."""
     blind_s = age_s + (settings.brake_delay_ns + settings.reaction_ns) / NS_PER_S
     half = settings.braking_mps2 * blind_s
     speeds = [TOP_MPS, -half + math.sqrt(half * half + 2 * settings.braking_mps2 * settings.sight_m)]
@@ -51,7 +51,7 @@ def formula_mps(age_s: float, settings: GovernorSettings) -> float:
     if settings.delay_margin:
         speeds.append(0.0)
         for speed_mps, delay_ns in settings.delay_margin:
-            if age_s <= delay_ns / NS_PER_S:
+            if tail_s <= delay_ns / NS_PER_S:
                 speeds[-1] = speed_mps
     return min(speeds)
 
@@ -85,7 +85,7 @@ def test_of_equal_limits_the_first_reason_of_the_table_is_reported() -> None:
 AGES_MS = st.one_of(
     st.floats(0.0, 1500.0), st.sampled_from([math.nan, math.inf, -math.inf, -1.0, 0.0, 200.0, 300.0, 1e30])
 )
-STEPS_MS = st.integers(-50, 1000)
+STEPS_MS = st.integers(0, 1000)
 EVENTS = st.lists(st.tuples(st.sampled_from(["note", "look"]), AGES_MS, STEPS_MS), max_size=25)
 ANY_SETTINGS = st.builds(
     GovernorSettings,
@@ -101,29 +101,62 @@ ANY_SETTINGS = st.builds(
 )
 
 
+class Oracle:
+    """The ages that a governor must know after some events, each computed from all events."""
+
+    def __init__(self, settings: GovernorSettings) -> None:
+        self.settings = settings
+        self.captured_ns: float | None = None
+        self.replaced: list[tuple[int, float]] = []
+        """Time of replacement and largest age of each picture."""
+
+    def note(self, age_ns: float, now_ns: int) -> bool:
+        """Note a picture; return whether it is newer than the one in force."""
+        if not 0 <= age_ns < math.inf:
+            self.captured_ns = None
+            return False
+        before_ns = self.captured_ns
+        if before_ns is not None and now_ns - age_ns <= before_ns:
+            return False
+        if before_ns is not None:
+            self.replaced.append((now_ns, now_ns - before_ns))
+        self.captured_ns = now_ns - age_ns
+        return True
+
+    def allowed_mps(self, now_ns: int) -> float:
+        """Return the highest speed that is allowed now."""
+        if self.captured_ns is None:
+            return 0.0
+        present_s = max(0.0, now_ns - self.captured_ns) / NS_PER_S
+        since_ns = now_ns - self.settings.window_ns
+        ages_ns = sorted(age_ns for at_ns, age_ns in self.replaced if at_ns >= since_ns)
+        tail_s = present_s
+        if ages_ns:
+            share = [(index + 1) / len(ages_ns) for index in range(len(ages_ns))]
+            tail_s = (
+                next(age for age, part in zip(ages_ns, share, strict=True) if part >= self.settings.tail) / NS_PER_S
+            )
+        return formula_mps(max(present_s, tail_s), tail_s, self.settings)
+
+
 def limits_after(settings: GovernorSettings, events: list[tuple[str, float, int]]) -> list[tuple[int, SpeedLimit]]:
     """Drive a governor through events, check its bounds at each one, and return times and limits."""
-    governor = Governor(settings, TOP_MPS)
+    governor, oracle = Governor(settings, TOP_MPS), Oracle(settings)
     governor.note_age(100.0 * NS_PER_MS, 0)
+    oracle.note(100.0 * NS_PER_MS, 0)
     governor.begin_drive(0)
-    found, now_ns, newer_ns, captured_ns = [(0, governor.limit(0))], 0, 0, -100.0 * NS_PER_MS
+    found, now_ns, newer_ns = [(0, governor.limit(0))], 0, 0
     for kind, age_ms, step_ms in events:
         now_ns, before, may_rise_mps = now_ns + step_ms * NS_PER_MS, found[-1][1], 0.0
         if kind == "note":
             governor.note_age(age_ms * NS_PER_MS, now_ns)
-            if not 0 <= age_ms < math.inf:
-                captured_ns = -math.inf
-            elif now_ns - age_ms * NS_PER_MS > captured_ns:
-                captured_ns = now_ns - age_ms * NS_PER_MS
-                may_rise_mps = settings.rise_mps2 * max(0, now_ns - newer_ns) / NS_PER_S
-                newer_ns = max(newer_ns, now_ns)
+            if oracle.note(age_ms * NS_PER_MS, now_ns):
+                may_rise_mps = settings.rise_mps2 * (now_ns - newer_ns) / NS_PER_S
+                newer_ns = now_ns
         limit = governor.limit(now_ns)
-        assert limit.mps <= governor.allowed(now_ns).mps
+        assert limit.mps <= oracle.allowed_mps(now_ns) + ROUNDING
         assert limit.mps - before.mps <= may_rise_mps + ROUNDING
-        if captured_ns == -math.inf:
-            assert limit == SpeedLimit(0.0, "no picture")
-        else:
-            assert limit.mps <= formula_mps(max(0.0, now_ns - captured_ns) / NS_PER_S, settings) + ROUNDING
+        assert (limit.reason == "no picture") == (oracle.captured_ns is None)
         found.append((now_ns, limit))
     return found
 
@@ -195,6 +228,29 @@ def test_the_tail_of_the_window_counts() -> None:
             governor.note_age(100 * NS_PER_MS, now_ns)
         after_late.append(governor.age_s(now_ns) or 0.0)
     assert after_late == pytest.approx([0.133, 0.433])
+
+
+def test_one_late_picture_is_no_delay_of_the_loop() -> None:
+    """One late picture does not lower the limit of the delay margin; many late ones do."""
+    settings = GovernorSettings(TOP_MPS, latency_limit_ns=2 * NS_PER_S, delay_margin=TABLE)
+    governor, now_ns = governed(settings), NOW_NS + PERIOD_NS + 300 * NS_PER_MS
+    governor.note_age(100 * NS_PER_MS, now_ns)
+    assert governor.limit(now_ns) == SpeedLimit(8.0, "delay margin")
+    for _ in range(20):
+        now_ns += PERIOD_NS + 300 * NS_PER_MS
+        governor.note_age(100 * NS_PER_MS, now_ns)
+    assert governor.limit(now_ns) == SpeedLimit(3.0, "delay margin")
+
+
+def test_time_that_goes_back_raises_no_limit() -> None:
+    """Times that jump back and forth never raise the limit by more than the time that really passed allows."""
+    governor = governed()
+    governor.limit(NOW_NS + NS_PER_S)
+    low = governor.limit(NOW_NS).mps
+    for _ in range(20):
+        for at_ns in (NOW_NS, NOW_NS + 10 * NS_PER_MS):
+            governor.note_age(50 * NS_PER_MS, at_ns)
+    assert governor.limit(NOW_NS + 10 * NS_PER_MS).mps <= low + 0.5 * 0.01 + ROUNDING
 
 
 def test_the_limit_falls_at_once_and_rises_slowly() -> None:

@@ -60,8 +60,8 @@ class Governor:
     """A speed limit that falls at once when the picture age grows, and rises slowly when it shrinks.
 
     The picture in force is the one from which the last accepted command was made. Its age grows until a command from a
-    newer picture replaces it. The governor's age is the larger one of two: the present age of the picture in force, and
-    the quantile `tail` of the largest ages that the pictures of the last `window_ns` reached.
+    newer picture replaces it. Two ages count: the present one of the picture in force, and the quantile `tail` of the
+    largest ages that the pictures of the last `window_ns` reached.
     """
 
     def __init__(self, settings: GovernorSettings, speed_limit_mps: float) -> None:
@@ -129,27 +129,41 @@ class Governor:
             self._limit = SpeedLimit(raised_mps, "recovery") if self._is_rising else allowed
 
     def allowed(self, now_ns: int) -> SpeedLimit:
-        """Return the highest speed that the present age allows, without slow rise and hysteresis."""
-        age_s = self.age_s(now_ns)
-        if age_s is None:
+        """Return the highest speed that the present ages allow, without slow rise and hysteresis.
+
+        Sight and latency limit the speed by the larger age. The delay margin does so by the quantile alone: one late
+        picture does not make a loop unstable.
+        """
+        ages = self._ages_s(now_ns)
+        if ages is None:
             return NO_PICTURE
-        settings = self.settings
+        present_s, tail_s = ages
+        age_s, settings = max(present_s, tail_s), self.settings
         return lowest(
             self._speed_limit,
             SpeedLimit(settings.sight_limit_mps(age_s), "sight"),
             SpeedLimit(settings.latency_limit_mps(age_s), "latency"),
-            SpeedLimit(settings.delay_margin_mps(age_s), "delay margin"),
+            SpeedLimit(settings.delay_margin_mps(tail_s), "delay margin"),
         )
 
     def age_s(self, now_ns: int) -> float | None:
-        """Return the picture age that the limit is for; None if no picture is in force."""
+        """Return the larger one of the two ages, in seconds; None if no picture is in force."""
+        ages = self._ages_s(now_ns)
+        return None if ages is None else max(ages)
+
+    def _ages_s(self, now_ns: int) -> tuple[float, float] | None:
+        """Return the present age of the picture in force, and the quantile; None if no picture is in force.
+
+        Without an age in the window, the quantile is the present age.
+        """
         if self._captured_ns is None:
             return None
         ages, sorted_ages_ns = self._ages, self._sorted_ages_ns
         while ages and ages[0][0] < now_ns - self.settings.window_ns:
             _, expired_ns = ages.popleft()
             del sorted_ages_ns[bisect_left(sorted_ages_ns, expired_ns)]
-        tail_ns = 0.0
-        if sorted_ages_ns:
-            tail_ns = sorted_ages_ns[max(0, math.ceil(self.settings.tail * len(sorted_ages_ns)) - 1)]
-        return max(tail_ns, now_ns - self._captured_ns) / NS_PER_S
+        present_s = max(0.0, now_ns - self._captured_ns) / NS_PER_S
+        if not sorted_ages_ns:
+            return present_s, present_s
+        rank = max(0, math.ceil(self.settings.tail * len(sorted_ages_ns)) - 1)
+        return present_s, sorted_ages_ns[rank] / NS_PER_S

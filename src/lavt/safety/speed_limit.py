@@ -14,8 +14,8 @@ SPEED_LIMIT_REASONS: Final[dict[SpeedLimitReason, str]] = {
     "picture.",
     "latency": "The picture age is above `latency_limit_ms`. Faster, the vehicle would drive a longer way blind than "
     "at the nominal speed with this limit.",
-    "delay margin": "The picture age is above the delay that the driver or controller tolerates at the next higher "
-    "speed.",
+    "delay margin": "The quantile of the picture ages is above the delay that the driver or controller tolerates at "
+    "the next higher speed.",
     "no picture": "No command was accepted yet whose picture has a known age.",
     "recovery": "The limit was lower, and rises slowly.",
 }
