@@ -87,6 +87,7 @@ def test_a_wrong_value_is_one_sentence(change: str, reason: str) -> None:
     assert "\n" not in str(rejected.value)
 
 
+@pytest.mark.full
 def test_the_shipped_delay_margins_are_those_of_the_theory() -> None:
     """At each speed of `configs/governor.yaml`, the loop of `designed` becomes unstable at the delay of the table."""
     table = load_config(SweepConfig, shipped("configs/governor.yaml")).safety.governor.delay_margin

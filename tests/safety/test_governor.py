@@ -132,10 +132,8 @@ class Oracle:
         ages_ns = sorted(age_ns for at_ns, age_ns in self.replaced if at_ns >= since_ns)
         tail_s = present_s
         if ages_ns:
-            share = [(index + 1) / len(ages_ns) for index in range(len(ages_ns))]
-            tail_s = (
-                next(age for age, part in zip(ages_ns, share, strict=True) if part >= self.settings.tail) / NS_PER_S
-            )
+            needed = self.settings.tail * len(ages_ns)
+            tail_s = next(age_ns for number, age_ns in enumerate(ages_ns, 1) if number >= needed) / NS_PER_S
         return formula_mps(max(present_s, tail_s), tail_s, self.settings)
 
 
@@ -161,7 +159,7 @@ def limits_after(settings: GovernorSettings, events: list[tuple[str, float, int]
     return found
 
 
-@hypothesis.settings(max_examples=30)
+@hypothesis.settings(max_examples=20)
 @given(ANY_SETTINGS, EVENTS)
 def test_the_limit_is_never_above_the_formula_and_rises_only_slowly(
     settings: GovernorSettings, events: list[tuple[str, float, int]]
@@ -173,7 +171,7 @@ def test_the_limit_is_never_above_the_formula_and_rises_only_slowly(
     assert limits_after(settings, events) == limits_after(settings, events)
 
 
-@hypothesis.settings(max_examples=30)
+@hypothesis.settings(max_examples=20)
 @given(ANY_SETTINGS, st.floats(0.0, 3.0), st.floats(0.0, 3.0))
 def test_a_larger_age_allows_no_higher_speed(settings: GovernorSettings, one_s: float, other_s: float) -> None:
     """The allowed speed never grows with the picture age."""
