@@ -34,9 +34,9 @@ class GovernorConfig(Section):
     reaction_ms: float = Field(0.0, ge=0, le=5000)
     """The reaction time of the person who drives, which the picture age does not contain; 0 for a controller."""
     delay_margin: tuple[tuple[_Speed, _Delay], ...] = ()
-    """Pairs of a speed in m/s and the largest picture age in ms that the driver or controller tolerates at this speed,
-    such as `[[5, 400], [8, 300]]`; empty: no such limit. No speed above the last one is allowed, and with a picture age
-    above the first delay none at all."""
+    """Pairs of a speed in m/s and the longest delay in ms that the driver or controller tolerates at this speed, as in
+    `[[5, 400], [8, 300]]`; empty: no such limit. The quantile `tail` is compared with them. No speed above the last
+    one is allowed, and with an age above the first delay none at all."""
     window_s: float = Field(5.0, ge=0.5, le=60)
     """The picture ages of this time count."""
     tail: float = Field(0.95, ge=0.5, le=1)
