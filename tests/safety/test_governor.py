@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import hypothesis
 import pytest
@@ -26,6 +27,11 @@ SETTINGS = GovernorSettings(nominal_mps=TOP_MPS)
 TABLE = ((3.0, 800 * NS_PER_MS), (5.0, 400 * NS_PER_MS), (8.0, 300 * NS_PER_MS))
 PERIOD_NS = 33 * NS_PER_MS
 ROUNDING = 1e-9
+
+
+def near(value: float) -> Any:
+    """Return what is equal to all values that differ from `value` by rounding only."""
+    return pytest.approx(value)
 
 
 def governed(settings: GovernorSettings = SETTINGS, *, age_ms: float = 100.0, pictures: int = 200) -> Governor:
@@ -74,7 +80,7 @@ def test_the_lowest_of_three_limits_is_allowed(settings: GovernorSettings, age_m
     governor = Governor(settings, TOP_MPS)
     governor.note_age(age_ms * NS_PER_MS, NS_PER_S)
     allowed = governor.allowed(NS_PER_S)
-    assert (allowed.reason, allowed.mps) == (expected.reason, pytest.approx(expected.mps))
+    assert (allowed.reason, allowed.mps) == (expected.reason, near(expected.mps))
 
 
 def test_of_equal_limits_the_first_reason_of_the_table_is_reported() -> None:
@@ -332,9 +338,9 @@ def test_above_its_limit_a_governed_vehicle_brakes_comfortably() -> None:
     rig.vehicle = vehicle_at(8.0)
     rig.age_ms = 380
     actuation = rig.drive_for(NS_PER_S)
-    assert rig.speed_limit == SpeedLimit(pytest.approx(TOP_MPS * 0.2 / 0.4), "latency")  # type: ignore[arg-type]
+    assert rig.speed_limit == SpeedLimit(near(TOP_MPS * 0.2 / 0.4), "latency")
     assert rig.gate.limiter.applied_limits == ("latency",)
-    assert (actuation.throttle, actuation.brake) == (0.0, pytest.approx(2.0 / MAX_BRAKING_MPS2))
+    assert (actuation.throttle, actuation.brake) == (0.0, near(2.0 / MAX_BRAKING_MPS2))
 
 
 def test_near_the_limit_the_pedals_are_moderate() -> None:
@@ -348,10 +354,10 @@ def test_near_the_limit_the_pedals_are_moderate() -> None:
         return actuation.throttle, actuation.brake
 
     assert pedals(4.4, 1.0, 0.0) == (1.0, 0.0)
-    assert pedals(4.75, 1.0, 0.0) == (pytest.approx(0.5), 0.0)
+    assert pedals(4.75, 1.0, 0.0) == (near(0.5), 0.0)
     assert pedals(5.0, 1.0, 0.0) == (0.0, 0.0)
-    assert pedals(5.125, 1.0, 0.0) == (0.0, pytest.approx(0.5 / MAX_BRAKING_MPS2))
-    assert pedals(-9.0, 1.0, 0.0) == (0.0, pytest.approx(LIMITS.governor_deceleration_mps2 / MAX_BRAKING_MPS2))
+    assert pedals(5.125, 1.0, 0.0) == (0.0, near(0.5 / MAX_BRAKING_MPS2))
+    assert pedals(-9.0, 1.0, 0.0) == (0.0, near(LIMITS.governor_deceleration_mps2 / MAX_BRAKING_MPS2))
     assert pedals(9.0, 0.0, 0.9) == (0.0, 0.9)
 
 
