@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -30,8 +31,8 @@ def test_every_example_is_tested() -> None:
 @pytest.mark.parametrize("name", EXPECTED_OUTPUT)
 def test_examples_run(name: str, tmp_path: Path) -> None:
     """Each example runs and prints its expected output."""
-    if name in NEEDED_PACKAGES:
-        pytest.importorskip(NEEDED_PACKAGES[name])
+    if find_spec(NEEDED_PACKAGES.get(name, "lavt")) is None:  # an import would change this process's environment
+        pytest.skip(f"the example needs {NEEDED_PACKAGES[name]}")
     completed = subprocess.run(
         [sys.executable, EXAMPLES / name, str(tmp_path), *ARGUMENTS.get(name, ())],
         capture_output=True,
