@@ -43,7 +43,8 @@ class Loop:
     control_ms: int = 100
     vehicle_clock_ns: int = 1_700_000_000 * NS_PER_S
     clock_step_ns: int = 0
-    """By how much the vehicle's wall clock is set after `CLOCK_SET_NS`."""
+    """By how much the vehicle's wall clock is set after `clock_set_ns`."""
+    clock_set_ns: int = CLOCK_SET_NS
 
     def drive(self, seconds: float, *, offset_m: float = 0.5) -> list[float]:
         """Return the lateral errors at each picture, and store the decisions."""
@@ -54,7 +55,7 @@ class Loop:
         self.decisions: list[Decision] = []
         for now_ns in range(0, round(seconds * NS_PER_S), STEP_NS):
             motion, wall_ns = car.motion, now_ns + self.vehicle_clock_ns
-            wall_ns += self.clock_step_ns * (now_ns >= CLOCK_SET_NS)
+            wall_ns += self.clock_step_ns * (now_ns >= self.clock_set_ns)
             if now_ns % FRAME_NS == 0:
                 slope = -math.tan(motion.heading_rad)
                 lane = Lane((-motion.y_m / math.cos(motion.heading_rad), slope, 0.0), 3.5, 2.0, 20.0, 1.0)
@@ -123,6 +124,12 @@ def test_no_pose_is_predicted_with_two_clocks(step_s: float, monkeypatch: pytest
     assert poses[-1][0] > 8.9
     for at_s, (x_m, _, _) in poses:
         assert x_m == pytest.approx(SPEED_MPS * total_delay_s, rel=0.1), at_s
+
+
+def test_without_a_prediction_it_looks_farther_ahead() -> None:
+    """While a clock that was set back by 2 s allows no prediction at 600 ms, the error does not grow."""
+    loop = Loop(controller("predictive"), clock_step_ns=-2 * NS_PER_S, clock_set_ns=2 * NS_PER_S)
+    assert max(map(abs, loop.drive(6))) < 0.6
 
 
 @pytest.mark.parametrize(

@@ -116,8 +116,8 @@ class CompensatingController:
     """A lane keeper that knows the delay of its loop, and does what its variant says.
 
     `history` gets the vehicle's states and the commands sent. Until the delay is known, and while pictures from before
-    a step of the vehicle's clock arrive, it drives as the lane keeper does. Without a lane it follows the last lane and
-    uses no pedal.
+    a step of the vehicle's clock arrive, it drives as the lane keeper does, and looks as far ahead as the last known
+    delay takes. Without a lane it follows the last lane and uses no pedal.
     """
 
     def __init__(
@@ -158,11 +158,11 @@ class CompensatingController:
                 self._measure_delay(exposed_ns, now_ns)
             else:  # the vehicle's clock was set since the picture
                 self._delay_ns = None
-        followed, pose = self._remembered.lane, self._remembered.pose
-        if self._variant.predicts:
-            pose = self._predict_pose(speed_mps, now_ns) or pose
+        followed = self._remembered.lane
+        predicted = self._predict_pose(speed_mps, now_ns) if self._variant.predicts else None
+        pose = predicted or self._remembered.pose
         limit_per_m = self._preset.curvature_limit_per_m(speed_mps, self._car.wheelbase_m)
-        distance_m = self._lookahead_m(speed_mps)
+        distance_m = self._lookahead_m(speed_mps, is_predicted=predicted is not None)
         self._curvature_per_m = clamp(pursuit_curvature_per_m(followed, distance_m, pose), limit_per_m)
         if self._variant.speeds_mps and self._total_delay_s is not None:
             highest_mps = interpolate(self._variant.speeds_mps, self._total_delay_s)
@@ -215,14 +215,17 @@ class CompensatingController:
         predicted = predict_path(self._car, motions, commands, since_ns, now_ns + delay_ns)
         return None if predicted is None else predicted.path[-1]
 
-    def _lookahead_m(self, speed_mps: float) -> float:
+    def _lookahead_m(self, speed_mps: float, *, is_predicted: bool) -> float:
         """Return the lookahead distance at this speed and delay."""
-        variant = self._variant
+        variant, lookahead_s = self._variant, self._preset.lookahead_s
         if variant.speeds_mps:  # at any speed, that of the highest one
-            return lookahead_m(self._preset.lookahead_s, max(speed_mps, self._preset.speed_mps))
-        if variant.lookaheads_s and self._total_delay_s is not None:
+            return lookahead_m(lookahead_s, max(speed_mps, self._preset.speed_mps))
+        if self._total_delay_s is None or is_predicted:
+            return lookahead_m(lookahead_s, speed_mps)
+        if variant.lookaheads_s:
             return lookahead_m(interpolate(variant.lookaheads_s, self._total_delay_s), speed_mps)
-        return lookahead_m(self._preset.lookahead_s, speed_mps)
+        # The lookahead of a variant that predicts is too short without a prediction.
+        return lookahead_m(max(lookahead_s, interpolate(LOOKAHEADS_S, self._total_delay_s)), speed_mps)
 
 
 def path_from(
