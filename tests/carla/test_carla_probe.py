@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -13,7 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.carla.stand_in import free_tcp_pair
 
-from lavt.vehicle.carla import probe
+from lavt.cli.main import main
+from lavt.config_file import shipped
+from lavt.vehicle.carla import library, probe
 from lavt.vehicle.carla.probe import NoServerError, ask_version
 
 ANSWER = msgspec.msgpack.encode([1, 1, None, [[1, "0.9.16"]]])
@@ -83,6 +87,24 @@ def test_a_port_without_a_program_and_an_unknown_host_are_named_at_once() -> Non
     for host in ("nowhere.invalid", "a..b", "x" * 300):
         with pytest.raises(NoServerError, match="the host is unknown"):
             ask_version(host, 2000, 20.0)
+
+
+@pytest.mark.full
+def test_a_sweep_without_a_server_says_so_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A sweep whose CARLA server is absent ends before its first run, with one sentence and exit code 2."""
+    port, out = free_tcp_pair(), tmp_path / "out"
+    monkeypatch.setattr(library, "version", lambda _: library.SUPPORTED)
+    changes = ("--set", f"vehicle.carla.port={port}", "--set", "routes=[a_key]", "--set", "conditions=[L0]")
+    words = ["sweep", str(shipped("configs/paper_carla.yaml")), *changes, "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", ["lavt", *words])
+    with pytest.raises(SystemExit) as raised:
+        main()
+    assert raised.value.code == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert f"no CARLA server answers at 127.0.0.1:{port}, because no program listens there" in sentence
+    assert not out.exists()
 
 
 @settings(max_examples=40)

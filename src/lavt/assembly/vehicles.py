@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 
@@ -22,9 +22,11 @@ from lavt.perception.lane_detector import GRID
 from lavt.streams import stream
 from lavt.vehicle.camera import Camera, FrameTimes, TimedCamera
 from lavt.vehicle.carla.camera import CarlaCamera
+from lavt.vehicle.carla.connection import check_server
 from lavt.vehicle.carla.follower import Follower
 from lavt.vehicle.carla.frames import FlatPose
 from lavt.vehicle.carla.guard import Guard, await_trial
+from lavt.vehicle.carla.library import check_library
 from lavt.vehicle.carla.session import BRAKED, CarlaSession
 from lavt.vehicle.carla.settings import CarlaSettings
 from lavt.vehicle.carla.ticker import Ticker
@@ -169,6 +171,18 @@ def carla_settings(config: ServerConfig, road: Road | None) -> CarlaSettings:
         is_asynchronous=carla.asynchronous,
         max_steering_rad=None if carla.max_steering_deg is None else math.radians(carla.max_steering_deg),
     )
+
+
+def check_carla_servers(configs: Iterable[VehicleConfig]) -> None:
+    """Raise `UserError` if a vehicle is in CARLA, and the package or the server is absent or has another version.
+
+    A sweep asks this once, instead of failing with each of its runs.
+    """
+    cars = {(config.carla.host, config.carla.port): config.carla for config in configs if config.kind == "carla"}
+    if cars:
+        check_library()
+    for carla in cars.values():
+        check_server(CarlaSettings(carla.host, carla.port, LONGEST_TICK_S, None, timeout_s=carla.timeout_s))
 
 
 def start_pose(config: ServerConfig, road: Road) -> FlatPose:

@@ -46,6 +46,7 @@ def sweep(
 
     Example: lavt sweep configs/sweep.yaml --set 'conditions=[L0, L3]' --out out/sweep
     """
+    from lavt.assembly.vehicles import check_carla_servers  # noqa: PLC0415 (slow: numpy)
     from lavt.experiment.runs.remote_run import RemoteServer  # noqa: PLC0415
     from lavt.experiment.sweep.cluster import check_cluster  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.sweep.sweep import drive_sweep, open_sweep  # noqa: PLC0415 (slow: scipy)
@@ -69,6 +70,8 @@ def sweep(
     remaining = sum(not is_finished(out / "runs" / run.name) for run in planned_runs)
     if remote and remaining:
         remote.check_connection()
+    if remaining and not (remote or cluster):  # otherwise, the server may be reachable for other machines only
+        check_carla_servers(run.config.vehicle for run in planned_runs)
     open_sweep(out, resume=resume)
     with (
         reserve_directory(out),

@@ -65,14 +65,20 @@ def sentences(settings: CarlaSettings, work: str) -> Iterator[None]:
         ) from None
 
 
-def connect(carla: Any, settings: CarlaSettings) -> Any:
-    """Return a client; raise `UserError` if no server answers, or one of another version."""
+def check_server(settings: CarlaSettings) -> None:
+    """Raise `UserError` if no server answers, or one of another version; the package `carla` is not used."""
     try:
         _check_version(ask_version(settings.host, settings.port, settings.timeout_s), settings)
-        client = _find_client(carla, settings)
-        _check_version(client.get_server_version(), settings)
     except NoServerError as error:
         raise _no_server(settings, str(error)) from None
+
+
+def connect(carla: Any, settings: CarlaSettings) -> Any:
+    """Return a client; raise `UserError` if no server answers, or one of another version."""
+    check_server(settings)
+    client = _find_client(carla, settings)
+    try:
+        _check_version(client.get_server_version(), settings)
     except RuntimeError:
         raise _no_server(settings, f"no answer came within {settings.timeout_s:g} s") from None
     return client
@@ -92,8 +98,8 @@ def _check_version(found: str | None, settings: CarlaSettings) -> None:
 def _no_server(settings: CarlaSettings, reason: str) -> UserError:
     forget_client(settings)
     return UserError(
-        f"no CARLA server answers at {settings.address}, because {reason}: start CARLA {SUPPORTED} there, or set "
-        f"{ADDRESS_KEYS}"
+        f"no CARLA server answers at {settings.address}, because {reason}: start CARLA {SUPPORTED} there, or give "
+        "another host or port (vehicle.carla.host, vehicle.carla.port)"
     )
 
 

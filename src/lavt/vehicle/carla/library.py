@@ -11,8 +11,8 @@ SUPPORTED = "0.9.16"
 """The version of client and server; another server's version aborts the client's process."""
 
 
-def load_library() -> Any:
-    """Return the module `carla`; raise `UserError` if it is not installed or has another version."""
+def check_library() -> None:
+    """Raise `UserError` if the package `carla` is not installed or has another version."""
     try:
         installed = version("carla")
     except PackageNotFoundError:
@@ -24,6 +24,11 @@ def load_library() -> Any:
         raise UserError(
             f"the package carla is {installed}, but LAVT supports {SUPPORTED} only: pip install carla=={SUPPORTED}"
         )
+
+
+def load_library() -> Any:
+    """Return the module `carla`; raise `UserError` if it is not installed or has another version."""
+    check_library()
     import carla  # noqa: PLC0415 (an extra, and large)
 
     return carla
