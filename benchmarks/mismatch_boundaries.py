@@ -37,6 +37,8 @@ OWN_VALUE = {"speed": 30 / 3.6}
 """The exact value of an axis whose runs have other settings."""
 MAX_DELAY_MS = 1900.0
 """The longest added delay of the video: the vehicle accepts no picture older than 2 s."""
+MOST_MS = 3000.0
+"""The longest critical delay that the model computes."""
 PRECISION_MS = 2.0
 COLUMNS = ("axis", "kind", "value", "theory_ms", "measured_ms", "outside")
 
@@ -142,7 +144,7 @@ def table_row(point: Point) -> str:
 
 
 def draw(points: Sequence[Point]) -> Figure:
-    """Draw the delay over each axis: lines by the model, and points as measured; a triangle is beyond the search."""
+    """Draw the delay over each axis: lines by the model, points as measured, triangles on the dotted line beyond it."""
     names = list(dict.fromkeys(point.axis for point in points))
     figure = Figure(figsize=(10.5, 6.2), dpi=100, layout="constrained")
     grid = figure.subplots(2, -(-len(names) // 2), squeeze=False, sharey=True)
@@ -153,21 +155,22 @@ def draw(points: Sequence[Point]) -> Figure:
             )
             if not line:
                 continue
-            theory_ms = [3000.0 if point.theory_ms is None else point.theory_ms for point in line]
+            theory_ms = [MOST_MS if point.theory_ms is None else point.theory_ms for point in line]
             axes.plot([point.value for point in line], theory_ms, color=colour, label=kind)
             for point in line:
                 if point.measured_ms is not None:
                     axes.plot(point.value, point.measured_ms, "o", color=colour, markersize=4)
                 elif point.outside == "beyond":
                     axes.plot(point.value, MAX_DELAY_MS, "^", color=colour, markersize=5)
-        axes.set_title(AXES[name].title, fontsize=9, loc="left")
-        axes.set_ylim(0, 2000)
+        axes.set_title(AXES[name].title, fontsize=8, loc="left")
+        axes.axhline(MAX_DELAY_MS, color="grey", linestyle=":", linewidth=1)
+        axes.set_ylim(0, MOST_MS)
         axes.grid(alpha=0.3)
     for axes in grid[:, 0]:
         axes.set_ylabel("total delay at the onset / ms")
     for axes in list(grid.flat)[len(names) :]:
         axes.set_visible(False)
-    grid[0][0].legend(fontsize=8, loc="upper left")
+    figure.legend(*grid[0][0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4)
     return figure
 
 

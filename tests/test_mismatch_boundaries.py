@@ -49,4 +49,4 @@ def test_points_outside_the_search_are_named() -> None:
     assert table_row(POINT).endswith("| 2.8448 | `predictive` | 2631 ms | beyond |")
     assert table_row(found).endswith("| 3.556 | `predictive` | 1585 ms | 1580 ms |")
     markers = [line.get_marker() for line in draw([POINT, found]).axes[0].get_lines()]
-    assert markers == ["None", "^", "o"]
+    assert markers == ["None", "^", "o", "None"]
