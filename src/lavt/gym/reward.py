@@ -34,7 +34,7 @@ def parse_weights(weights: Mapping[str, float] | None) -> RewardWeights:
         if name not in known:
             raise UserError(f"there is no term {name!r} of the reward; choose among {', '.join(known)}")
         if not is_number(weight, 0.0):
-            raise UserError(f"the weight of {name} must be a finite number and at least 0, not {weight!r}")
+            raise UserError(f"the weight of {name} is {weight!r}: give a finite number that is at least 0")
     return RewardWeights(**(weights or {}))
 
 

@@ -16,13 +16,13 @@ def is_number(value: Any, least: float = -math.inf) -> bool:
 def check_positive(name: str, value: Any) -> None:
     """Raise `UserError` unless the value is a finite number above 0."""
     if not is_number(value, 0.0) or value == 0:
-        raise UserError(f"{name} must be a finite number above 0, not {value!r}")
+        raise UserError(f"{name} is {value!r}: give a finite number above 0")
 
 
 def check_count(name: str, value: Any, most: int) -> None:
     """Raise `UserError` unless the value is a whole number from 0 to `most`."""
     if not isinstance(value, int) or not is_number(value, 0) or value > most:
-        raise UserError(f"{name} must be a whole number from 0 to {most}, not {value!r}")
+        raise UserError(f"{name} is {value!r}: give a whole number from 0 to {most}")
 
 
 def parse_names(option: str, names: Any, default: str) -> tuple[str, ...]:
@@ -31,7 +31,7 @@ def parse_names(option: str, names: Any, default: str) -> tuple[str, ...]:
         return (default,)
     result = (names,) if isinstance(names, str) else tuple(names) if isinstance(names, list | tuple) else ()
     if not result or not all(isinstance(name, str) for name in result):
-        raise UserError(f"{option} must be a name or a list of names, not {names!r}")
+        raise UserError(f"{option} is {names!r}: give a name or a list of names")
     return result
 
 
@@ -41,7 +41,5 @@ def parse_range_ms(option: str, delay: Any) -> tuple[float, float] | None:
         return None
     limits = tuple(delay) if isinstance(delay, list | tuple) else (delay, delay)
     if len(limits) != 2 or not all(is_number(limit, 0.0) for limit in limits) or limits[0] > limits[1]:
-        raise UserError(
-            f"{option} must be a delay in ms, or the smallest and the largest delay, such as (0, 300), not {delay!r}"
-        )
+        raise UserError(f"{option} is {delay!r}: give a delay in ms, or the smallest and the largest, such as (0, 300)")
     return float(limits[0]), float(limits[1])

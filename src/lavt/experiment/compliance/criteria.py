@@ -78,7 +78,7 @@ def parse_thresholds(words: Iterable[str]) -> dict[str, float]:
     for word in words:
         name, equals, text = word.partition("=")
         if not equals or name not in CRITERIA:
-            raise UserError(f"--threshold {word} is not one of {'=, '.join(CRITERIA)}= with a number")
+            raise UserError(f"--threshold {word} names no criterion: give a number for one of {'=, '.join(CRITERIA)}=")
         try:
             value = float(text)
         except ValueError:
