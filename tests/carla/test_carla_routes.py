@@ -12,7 +12,7 @@ from tests.carla.stand_in import REPOSITORY, stand_in
 
 from lavt.cli.main import main
 
-pytestmark = pytest.mark.full
+pytestmark = [pytest.mark.full, pytest.mark.timeout(900)]  # two sweeps and three reports, on a busy host
 
 HAMLET = REPOSITORY / "tests" / "opendrive" / "data" / "hamlet.xodr"
 PICTURE = ("320", "240")
