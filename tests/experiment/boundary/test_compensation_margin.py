@@ -84,6 +84,21 @@ def test_no_smaller_setting_keeps_the_rule(kind: str) -> None:
     assert min(margins_rad(kind, -0.02)) < MARGIN_RAD
 
 
+@pytest.mark.parametrize(
+    ("kind", "change", "low_ms", "high_ms"),
+    [
+        ("lane_keeper", "vehicle.speed_report_factor=0.75", 197, 247),
+        ("constant_delay", "controller.compensation.camera_delay_s=0.2", 0, 417),
+        ("constant_delay", "camera.sensor_delay_ms=100", 0, 600),
+    ],
+)
+def test_the_model_knows_wrong_speeds_and_stamps(kind: str, change: str, low_ms: float, high_ms: float) -> None:
+    """The critical delay with a wrong speed report, or a wrong age of the picture, is far below the exact one."""
+    critical_ms = theoretical_ms(config(kind, "controller.preset=designed", change))
+    assert critical_ms is not None
+    assert low_ms < critical_ms < high_ms
+
+
 def test_exact_knowledge_needs_no_shorter_delay() -> None:
     """The predictive loop is stable at every total delay up to 1.5 s, the lane keeper's only up to 0.34 s."""
     loop = LateralLoop(VARIANTS["predictive"].lookahead_s)
@@ -110,6 +125,7 @@ def config(kind: str, *changes: str) -> RunConfig:
         ("predictive", ("controller.wheelbase_m=4.4", "network.control.delay_ms=100")),
         ("constant_delay", ()),
         ("smith", ("controller.wheelbase_m=5.5",)),
+        ("constant_delay", ("controller.compensation.camera_delay_s=0.2",)),
     ],
 )
 def test_the_whole_loop_becomes_unstable_where_the_model_does(kind: str, changes: tuple[str, ...]) -> None:

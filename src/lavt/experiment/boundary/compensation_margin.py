@@ -19,7 +19,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import expm
 
-from lavt.config import RunConfig
+from lavt.config import CompensationConfig, RunConfig
 from lavt.config_file import conditions
 from lavt.control.compensation import MODEL_MEMORY_S, VARIANTS, Variant, interpolate
 from lavt.control.pure_pursuit import LOOKAHEAD_RANGE_M
@@ -162,6 +162,7 @@ def _predict(
     """
     (loop, predictor), rows = known, rows.copy()
     assumed_lag_s = max(predictor.steering_lag_s, _SHORTEST_LAG_S)
+    reported_mps = loop.speed_mps * loop.speed_report_factor
     end_s = remembered.effect_s
     if predictor.uses_reports:
         lag_s = max(loop.car.steering_lag_s, _SHORTEST_LAG_S)
@@ -169,7 +170,7 @@ def _predict(
             rows[2] = command + (rows[2] - command) * math.exp(duration_s / lag_s)
         reported_s = min(received.effect_s - loop.car.steering_dead_time_s - predictor.unreported_s, end_s)
         for duration_s, command in received.during(since_s, reported_s):
-            rows = _move(rows, command, duration_s, loop.speed_mps, predictor.wheelbase_m, lag_s)
+            rows = _move(rows, command, duration_s, reported_mps, predictor.wheelbase_m, lag_s)
         since_s = max(since_s, reported_s)
     else:
         begin_s = since_s - MODEL_MEMORY_S
@@ -177,7 +178,7 @@ def _predict(
         for duration_s, command in remembered.during(begin_s, since_s):
             rows[2] = command + (rows[2] - command) * math.exp(-duration_s / assumed_lag_s)
     for duration_s, command in remembered.during(since_s, end_s):
-        rows = _move(rows, command, duration_s, loop.speed_mps, predictor.wheelbase_m, assumed_lag_s)
+        rows = _move(rows, command, duration_s, reported_mps, predictor.wheelbase_m, assumed_lag_s)
     return rows[:2]
 
 
@@ -231,7 +232,9 @@ def configured_variant(config: RunConfig) -> tuple[Variant, LateralLoop, Predict
     if variant is None or config.vehicle.kind != "simulator":
         return None
     loop = run_loop(config, controller.lookahead_s or variant.lookahead_s)
-    known = controller.compensation
+    known = config.controller.compensation
+    assumed, right = known.settings_at(config.camera.rate_hz), CompensationConfig().settings_at(config.camera.rate_hz)
+    camera_error_s = assumed.camera_delay_s - right.camera_delay_s - config.camera.sensor_delay_ms / 1000
     predictor = Predictor(
         steering_lag_s=known.steering_lag_s,
         steering_dead_time_s=known.steering_dead_time_s,
@@ -239,8 +242,10 @@ def configured_variant(config: RunConfig) -> tuple[Variant, LateralLoop, Predict
         uses_reports=variant.uses_reports,
         unreported_s=Predictor().unreported_s
         + config.network.requested(conditions()[config.network.condition]).control_ms / 1000,
-        delay_error_s=known.delay_error_s if variant.measures_delay else 0.0,
+        # A measured delay ends at a time that was measured; an assumed one begins at the assumed exposure.
+        delay_error_s=known.delay_error_s if variant.measures_delay else -camera_error_s,
         constant_delay_s=None if variant.measures_delay else known.constant_delay_s,
+        lane_error_s=camera_error_s + assumed.average_lag_s - right.average_lag_s,
     )
     return variant, loop, predictor
 
@@ -269,7 +274,7 @@ def scheduled_loop(variant: Variant, loop: LateralLoop, total_delay_s: float) ->
     nearest_m, farthest_m = LOOKAHEAD_RANGE_M
     distance_m, speed_mps = loop.lookahead_s * loop.speed_mps, loop.speed_mps
     if variant.lookaheads_s:
-        distance_m = interpolate(variant.lookaheads_s, total_delay_s) * speed_mps
+        distance_m = interpolate(variant.lookaheads_s, total_delay_s) * speed_mps * loop.speed_report_factor
     if variant.speeds_mps:
-        speed_mps = min(speed_mps, interpolate(variant.speeds_mps, total_delay_s))
+        speed_mps = min(speed_mps, interpolate(variant.speeds_mps, total_delay_s) / loop.speed_report_factor)
     return replace(loop, lookahead_s=min(max(distance_m, nearest_m), farthest_m) / speed_mps, speed_mps=speed_mps)

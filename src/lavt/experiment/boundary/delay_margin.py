@@ -62,6 +62,8 @@ class LateralLoop:
     car: CarParameters = DEFAULT_CAR
     controller_wheelbase_m: float | None = None
     """The wheelbase that the controller assumes; None: the car's wheelbase."""
+    speed_report_factor: float = 1.0
+    """The speed that the car reports, divided by its true speed, which is `speed_mps`."""
 
     @property
     def gain(self) -> FloatArray:
@@ -87,12 +89,14 @@ def run_loop(config: RunConfig, lookahead_s: float | None) -> LateralLoop:
     controller = config.controller
     preset = controller.effective_preset()
     lookahead_s = preset.lookahead_s if lookahead_s is None else lookahead_s
+    speed_mps = preset.speed_mps / config.vehicle.speed_report_factor  # the controller keeps the reported speed
     return LateralLoop(
-        lookahead_s=lookahead_m(lookahead_s, preset.speed_mps) / preset.speed_mps,
-        speed_mps=preset.speed_mps,
+        lookahead_s=lookahead_m(lookahead_s, preset.speed_mps) / speed_mps,
+        speed_mps=speed_mps,
         frame_rate_hz=config.camera.rate_hz,
         car=car_of(config.vehicle),
         controller_wheelbase_m=controller.wheelbase_m,
+        speed_report_factor=config.vehicle.speed_report_factor,
     )
 
 
