@@ -142,7 +142,8 @@ class SafetyGate:
             if is_fresh:
                 self.machine.trigger("fresh command")
         if self.governor is not None:
-            self.governor.note_age(now_ns - self.issued_stamps.captured_ns(command.stamp_ns), now_ns)
+            age_ns = now_ns - self.issued_stamps.captured_ns(command.stamp_ns)
+            self.governor.note_age(age_ns, now_ns, is_newer=is_fresh)
         return ACCEPTED
 
     def rejection_reason(self, command: Command, vehicle: VehicleState, now_ns: int) -> RejectionReason | None:

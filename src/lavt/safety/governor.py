@@ -60,8 +60,9 @@ class Governor:
     """A speed limit that falls at once when the picture age grows, and rises slowly when it shrinks.
 
     The picture in force is the one from which the last accepted command was made. Its age grows until a command from a
-    newer picture replaces it. Two ages count: the present one of the picture in force, and the quantile `tail` of the
-    largest ages that the pictures of the last `window_ns` reached.
+    picture that is newer than all before replaces it; until then, a command from an older picture makes it older. Two
+    ages count: the present one of the picture in force, and the quantile `tail` of the largest ages that the pictures
+    of the last `window_ns` reached.
     """
 
     def __init__(self, settings: GovernorSettings, speed_limit_mps: float) -> None:
@@ -77,18 +78,21 @@ class Governor:
         """Time of replacement, and largest age, of each picture of the window; oldest first."""
         self._sorted_ages_ns: list[float] = []
 
-    def note_age(self, age_ns: float, now_ns: int) -> None:
+    def note_age(self, age_ns: float, now_ns: int, *, is_newer: bool = True) -> None:
         """Note the age, at `now_ns`, of the picture from which an accepted command was made.
 
-        A picture that is not newer than the one in force changes nothing. After a negative age, or one that is not
-        finite, no picture is in force.
+        `is_newer` tells whether the picture is newer than those of all earlier commands. Only such a picture makes the
+        age smaller; another makes it larger if it is older than the one in force. A picture that was captured at the
+        same time changes nothing. After a negative age, or one that is not finite, no picture is in force.
         """
         self.limit(now_ns)  # for the largest age of the picture that is replaced
         if not 0 <= age_ns < math.inf:
             self._captured_ns = None
             return
         captured_ns, replaced_ns = now_ns - age_ns, self._captured_ns
-        if replaced_ns is not None and captured_ns <= replaced_ns:
+        if replaced_ns is not None and (captured_ns == replaced_ns or not is_newer):
+            self._captured_ns = min(captured_ns, replaced_ns)
+            self.limit(now_ns)
             return
         if replaced_ns is not None:
             self._ages.append((now_ns, now_ns - replaced_ns))
