@@ -141,6 +141,25 @@ def test_time_without_a_known_frame() -> None:
     assert entry["picture_age_ms"]["max"][1] == np.inf
 
 
+@pytest.mark.parametrize("stamped_ms", [0, 5000])
+def test_a_frame_is_not_younger_than_its_stamp(stamped_ms: float) -> None:
+    """A capture after the stamp counts as the stamp, and a frame that is newer than its command as unknown."""
+    frames = [frame(stamped_ms, 9000)]
+    commands = [{**command(0, stamped_ms), "stamp_ns": ns(stamped_ms)}]
+    entry = evaluated(record(frame=frames, admission=commands, truth=STEADY)).entry
+    assert entry["above_share"] == (pytest.approx((0.9, 0.9)) if stamped_ms == 0 else (0.0, 1.0))
+    assert entry["picture_age_ms"]["max"] == (pytest.approx((1000.0, 1000.0)) if stamped_ms == 0 else (0.0, np.inf))
+
+
+def test_a_driver_cannot_take_longer_than_the_loop() -> None:
+    """If a client states more time than passed since the exposure, the two-way latency is not known to be within."""
+    frames = [frame(number * 200, number * 200 - 10) for number in range(-1, 5)]
+    commands = [command(number * 200 + 180, number * 200, driver_ms=10_000) for number in range(-1, 5)]
+    entry = evaluated(record(frame=frames, admission=commands, truth=STEADY)).entry
+    assert entry["two_way_ms"]["max"] == pytest.approx((0.0, 190.0))
+    assert entry["verdicts"]["two_way_above_share"] == "not decided"
+
+
 def test_the_driver_takes_its_time() -> None:
     """The two-way latency is the frame age at the application of the command, without the driver's own time."""
     frames = [frame(number * 100, number * 100 - 10) for number in range(-1, 10)]

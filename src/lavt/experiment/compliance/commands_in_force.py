@@ -80,11 +80,18 @@ def commands_in_force(
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), stamps_ns)
     captured_ns = look_up(frames.ints("stamp_ns"), frames.ints("capture_ns"), stamps_ns)
     applied_ns = commands.ints("applied_mono_ns")
+    captured_ns = np.where(
+        (captured_ns == MISSING) | (stamped_ns == MISSING), captured_ns, np.minimum(captured_ns, stamped_ns)
+    )
     newest_ns, oldest_ns = _exposure(stamped_ns, captured_ns, camera_ns, began_ns)
-    client_low_ns, client_high_ns = _driver_time(commands, page_pictures)
     applied_since_ns = _since(applied_ns, began_ns)
+    is_possible = newest_ns <= applied_since_ns  # a record in which an effect is before its cause tells nothing
+    newest_ns, oldest_ns = np.where(is_possible, newest_ns, np.inf), np.where(is_possible, oldest_ns, -np.inf)
+    client_low_ns, client_high_ns = _driver_time(commands, page_pictures)
+    oldest_age_ns = applied_since_ns - oldest_ns
     two_way_low_ns = np.where(np.isfinite(newest_ns), applied_since_ns - newest_ns - client_high_ns, 0.0)
-    two_way_high_ns = np.where(np.isfinite(oldest_ns), applied_since_ns - oldest_ns - client_low_ns, np.inf)
+    # A driver's time that is longer than the frame's age is impossible: then it is unknown.
+    two_way_high_ns = np.where(client_low_ns <= oldest_age_ns, oldest_age_ns - client_low_ns, oldest_age_ns)
     starts_ns = np.clip(applied_ns, began_ns, max(began_ns, ended_ns))
     ends_ns = np.append(starts_ns[1:], max(began_ns, ended_ns))[: len(starts_ns)]
     chosen = ends_ns > starts_ns
