@@ -32,6 +32,7 @@ def test_the_summary_has_the_agreed_keys(demo: Demo) -> None:
         "contrasts",
         "real",
         "groups",
+        "controllers",
         "paper",
         "failed",
     }
