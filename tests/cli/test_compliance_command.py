@@ -18,6 +18,7 @@ BAD_OPTIONS = {
     "a negative limit": (["--limit-ms=-5"], "--limit-ms is -5"),
     "a limit that is no number": (["--limit-ms", "nan"], "--limit-ms is nan"),
     "an infinite limit": (["--limit-ms", "inf"], "--limit-ms is inf"),
+    "a limit of years": (["--limit-ms", "1e300"], "--limit-ms is 1e+300: give a positive number of ms, at most 1e+06"),
     "an outage of 0": (["--outage-ms", "0"], "--outage-ms is 0"),
     "a nominal speed of 0": (["--nominal-kmh", "0"], "--nominal-kmh is 0: give a positive speed"),
     "a camera of the future": (["--camera-ms=-1"], "--camera-ms is -1"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -50,6 +51,7 @@ class FakeLaneDetector:
     """A fake `LaneDetector` that returns a straight lane with a given confidence."""
 
     confidence: float = 1.0
+    offset_m: float = 0.0
     pictures: list[Picture] = field(default_factory=list)
     forget_calls: int = 0
 
@@ -60,7 +62,7 @@ class FakeLaneDetector:
     def detect(self, picture_bgr: Picture) -> Lane:
         """Return the lane."""
         self.pictures.append(picture_bgr)
-        return Lane(centre=(0.0, 0.0, 0.0), width_m=3.5, near_m=3.6, far_m=20.0, confidence=self.confidence)
+        return Lane(centre=(self.offset_m, 0.0, 0.0), width_m=3.5, near_m=3.6, far_m=20.0, confidence=self.confidence)
 
 
 class FakeController:
@@ -331,6 +333,20 @@ def test_without_a_lane_the_driver_brakes_and_stops(lost_ms: int, mode: str, kin
         (command,) = bench.deliver_picture()
     assert command.mode == mode
     assert (command.brake >= CLIENT_LIMITS.brake) == brakes
+
+
+@pytest.mark.parametrize("kind", ["lane_keeper", "two_point"])
+def test_a_lane_that_is_not_finite_is_no_lane(kind: str) -> None:
+    """A confident lane that is not a number is counted and treated as lost: the driver brakes and requests a stop."""
+    bench = Bench(controller=make_controller(kind, DESIGNED, 2.8448)).start_driving()
+    bench.detector.offset_m = math.nan
+    for _ in range(2520 // 20):
+        bench.mono_ns += 20 * NS_PER_MS
+        bench.deliver_state("driving")
+        (command,) = bench.deliver_picture()
+        assert math.isfinite(command.steering_rad)
+    assert command.mode == "stop"
+    assert bench.node.counts["lanes_not_finite"] == 2520 // 20
 
 
 @pytest.mark.parametrize(("lane_confidence", "mode"), [(0.2, "drive"), (0.5, "stop")])

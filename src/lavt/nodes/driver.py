@@ -5,10 +5,12 @@ Its steps are: picture and stamp (`picture_reader`), lane detection, decision, c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from lavt.control.client_limits import ClientLimits
 from lavt.control.drive_controller import DriveController, LoopReader, StampReader
@@ -91,7 +93,14 @@ class DriverNode(Commander):
         # the car moved. A negative gap comes from a clock that was set back, so the true gap is unknown.
         if self.session.phase != "driving" or not 0 <= since_last_ns <= LONGEST_GAP_NS:
             self._detector.forget()
-        return PerceivedFrame(view, view.stamp_ns, self._detector.detect(view.received.picture))
+        return PerceivedFrame(view, view.stamp_ns, self._finite(self._detector.detect(view.received.picture)))
+
+    def _finite(self, lane: Lane) -> Lane:
+        """Return a detected lane; one of a detector of the user's own that is not finite counts as no lane."""
+        if all(map(math.isfinite, (*lane.centre, lane.width_m, lane.confidence))):
+            return lane
+        self._counts["lanes_not_finite"] += 1
+        return replace(lane, centre=(0.0, 0.0, 0.0), width_m=0.0, confidence=0.0)
 
     def _decide(self, perceived: PerceivedFrame, now: Now) -> PerceivedFrame:
         self._lane_state = self._lane_watch.check(perceived.lane.confidence, now.mono_ns)

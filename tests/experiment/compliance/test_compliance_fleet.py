@@ -220,6 +220,8 @@ def test_the_nominal_speed_is_that_of_the_config(tmp_path: Path) -> None:
         config.write_text(text)
         with pytest.raises(UserError, match="--nominal-kmh"):
             recorded_speed_limit(config)
+    with pytest.raises(UserError, match="--nominal-kmh"):
+        recorded_speed_limit(tmp_path)
 
 
 @pytest.mark.full

@@ -124,7 +124,7 @@ def recorded_speed_limit(config: Path) -> float:
     Raises `UserError` for a config that cannot be read.
     """
     try:
-        content = yaml.safe_load(config.read_text(encoding="utf-8")) if config.is_file() else {}
+        content = yaml.safe_load(config.read_text(encoding="utf-8")) if config.exists() else {}
         speed_mps = float(((content or {}).get("safety") or {}).get("speed_limit_mps", LIMITS.speed_limit_mps))
     except (OSError, ValueError, TypeError, AttributeError, yaml.YAMLError):
         speed_mps = math.nan

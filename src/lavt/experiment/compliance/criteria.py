@@ -38,6 +38,10 @@ CRITERIA: Mapping[str, Criterion] = {
 threshold of 5 s leaves room for a slope or weak brakes."""
 
 
+MAX_MS = 1e6
+"""The largest limit: no picture of a drive is older."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComplianceLimits:
     """What drives are compared with. Raises `UserError` for a limit that is not a positive number, and so on."""
@@ -54,7 +58,7 @@ class ComplianceLimits:
 
     def __post_init__(self) -> None:
         for name, value in (("--limit-ms", self.latency_ms), ("--outage-ms", self.outage_ms)):
-            _check(name, value, math.isfinite(value) and value > 0, "a positive number of ms")
+            _check(name, value, 0 < value <= MAX_MS, f"a positive number of ms, at most {MAX_MS:g}")
         if self.nominal_mps is not None:
             is_valid = math.isfinite(self.nominal_mps) and self.nominal_mps > 0
             _check("--nominal-kmh", self.nominal_mps * 3.6, is_valid, "a positive speed in km/h")
