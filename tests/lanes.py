@@ -33,8 +33,8 @@ class LaneSpec:
     commands: tuple[tuple[str, ...], ...]
     limit_min: float
     """A lane that takes longer is killed and has failed."""
-    meanwhile: tuple[LaneSpec, ...] = ()
-    """Lanes that run one after the other, at the lowest priority, from the last command on and beside the next ones."""
+    meanwhile: LaneSpec | None = None
+    """Another lane that starts with the last command, at the lowest priority, and goes on beside the lanes after it."""
 
 
 def pytest(*arguments: str) -> tuple[str, ...]:
@@ -51,11 +51,8 @@ CAN_DRIVES = "tests/kernel/test_can.py"
 """These tests run alone, because other work slows the machines, and one machine's only processor is just fast enough
 for the drives of these tests."""
 KERNEL = (sys.executable, "tests/kernel/run", *SHOW_SLOWEST)
-IN_BACKGROUND = (
-    LaneSpec("quick", (pytest("--timeout=1800"),), 40),
-    LaneSpec("full", (pytest("-m", "full", "--timeout=1800"),), 40),
-)
-"""These lanes need no clock, so they run beside lanes that mostly wait. A test has more time here."""
+FULL = LaneSpec("full", (pytest("-m", "full", "--timeout=1800"),), 40)
+"""A test has more time here, because the lane runs at the lowest priority beside others."""
 LINTERS = (
     program("ruff", "check"),
     program("ruff", "format", "--check"),
@@ -65,9 +62,10 @@ LINTERS = (
 )
 LANES = (
     LaneSpec("linters", LINTERS, 10),
+    LaneSpec("quick", (pytest(),), 15),
     LaneSpec("realtime", (pytest("-m", "realtime"),), 35),
     LaneSpec("field", (pytest("tests/field"),), 35),
-    LaneSpec("kernel", ((*KERNEL, CAN_DRIVES), (*KERNEL, f"--ignore={CAN_DRIVES}")), 30, meanwhile=IN_BACKGROUND),
+    LaneSpec("kernel", ((*KERNEL, CAN_DRIVES), (*KERNEL, f"--ignore={CAN_DRIVES}")), 30, meanwhile=FULL),
     LaneSpec("interop", (pytest("tests/interop"),), 5),
     LaneSpec("browser", (pytest("tests/browser"),), 10),
 )
@@ -92,7 +90,7 @@ def write(text: str) -> None:
 
 def select_lanes(names: Sequence[str]) -> list[LaneSpec]:
     """Return the named lanes, to run sequentially in this order, or all lanes if no lane is named."""
-    lanes = {lane.name: replace(lane, meanwhile=()) for lane in (*LANES, *IN_BACKGROUND)}
+    lanes = {lane.name: replace(lane, meanwhile=None) for lane in (*LANES, FULL)}
     return [lanes[name] for name in names] if names else list(LANES)
 
 
@@ -103,7 +101,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.lanes", description="Run the lanes of tests.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="linters, quick, full, ...; by default all")
     names = parser.parse_args().names
-    known = [lane.name for lane in (*LANES, *IN_BACKGROUND)]
+    known = [lane.name for lane in (*LANES, FULL)]
     if unknown := [name for name in names if name not in known]:
         parser.error(f"there is no lane {unknown[0]!r}: name some of {', '.join(known)}")
     return run_lanes(select_lanes(names), write=write)

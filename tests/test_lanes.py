@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from tests.lanes import (
-    IN_BACKGROUND,
+    FULL,
     LANES,
     QUICK,
     REPOSITORY,
@@ -29,7 +29,7 @@ from tests.support.lane_runner import LaneOutcome, closing_line, parse_counts, r
 from lavt.domain import NS_PER_S
 
 PYTEST_OPTIONS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
-PYTEST_LANES = {lane.name: lane.commands[0][3:] for lane in (*LANES, *IN_BACKGROUND) if "pytest" in lane.commands[0]}
+PYTEST_LANES = {lane.name: lane.commands[0][3:] for lane in (*LANES, FULL) if "pytest" in lane.commands[0]}
 """The arguments of pytest in each lane that is a single pytest command."""
 
 
@@ -124,14 +124,13 @@ def test_every_lane_is_documented() -> None:
 
 
 def test_lanes_can_be_selected_by_name() -> None:
-    """Without names all lanes run, quick and full beside kernel and the lanes after it; or else the named lanes."""
+    """Without names all lanes run, `full` only beside `kernel` and the lanes after it; or else the named lanes."""
     assert select_lanes([]) == list(LANES)
-    assert [lane.name for lane in IN_BACKGROUND] == ["quick", "full"]
-    assert [lane.name for lane in LANES if lane.meanwhile] == ["kernel"]
+    assert [lane.name for lane in LANES if lane.meanwhile is FULL] == ["kernel"]
     assert [lane.name for lane in LANES][-3:] == ["kernel", "interop", "browser"]
     assert [(lane.name, lane.meanwhile) for lane in select_lanes(["full", "kernel"])] == [
-        ("full", ()),
-        ("kernel", ()),
+        ("full", None),
+        ("kernel", None),
     ]
     unknown = subprocess.run(
         [sys.executable, "-m", "tests.lanes", "quik"], cwd=REPOSITORY, capture_output=True, text=True, check=False
@@ -157,7 +156,7 @@ def test_runner_adds_up_the_results_of_the_lanes() -> None:
             "kernel",
             (shell("sleep 0.3; echo '== 3 passed, 1 rerun in 62.10s (0:01:02) =='"),),
             1,
-            meanwhile=(LaneSpec("full", (shell("nice; echo '== 1 passed in 0.10s =='"),), 1),),
+            meanwhile=LaneSpec("full", (shell("nice; echo '== 1 passed in 0.10s =='"),), 1),
         ),
     )
     assert code == 0
@@ -174,7 +173,7 @@ def test_a_lane_at_the_same_time_starts_with_the_last_command(tmp_path: Path) ->
     began, ended = tmp_path / "began", tmp_path / "ended"
     other = LaneSpec("full", (shell(f"touch {began}; test -e {ended}"),), 1)
     first = shell(f"sleep 0.3; test ! -e {began} && touch {ended}; exit 4")
-    code, output = run(LaneSpec("kernel", (first, shell(f"until test -e {began}; do sleep 0.1; done")), 1, (other,)))
+    code, output = run(LaneSpec("kernel", (first, shell(f"until test -e {began}; do sleep 0.1; done")), 1, other))
     assert code == 1
     assert output.count("ended with") == output.count("ended with 4") == 1
 
@@ -183,27 +182,17 @@ def test_a_lane_at_the_same_time_goes_on_beside_the_next_lanes(tmp_path: Path) -
     """A lane that runs at the same time as another still runs during the next lane; its output follows at the end."""
     began = tmp_path / "began"
     other = LaneSpec("full", (shell(f"until test -e {began}; do sleep 0.1; done; echo other"),), 1)
-    kernel = LaneSpec("kernel", (shell("true"),), 1, meanwhile=(other,))
+    kernel = LaneSpec("kernel", (shell("true"),), 1, meanwhile=other)
     code, output = run(kernel, LaneSpec("browser", (shell(f"touch {began}; sleep 0.5; echo browser"),), 1))
     assert code == 0
     assert output.index("---- browser\nbrowser") < output.index("---- full\nother")
-
-
-def test_lanes_at_the_same_time_run_one_after_the_other(tmp_path: Path) -> None:
-    """Of several lanes that run at the same time as another, each starts when the one before it has ended."""
-    ended = tmp_path / "ended"
-    first = LaneSpec("quick", (shell(f"sleep 0.5; touch {ended}"),), 1)
-    second = LaneSpec("full", (shell(f"test -e {ended} && echo second"),), 1)
-    code, output = run(LaneSpec("kernel", (shell("true"),), 1, meanwhile=(first, second)))
-    assert code == 0
-    assert output.index("---- quick") < output.index("---- full\nsecond")
 
 
 @pytest.mark.parametrize("meanwhile", [False, True])
 def test_failing_lane_fails_the_run(meanwhile: bool) -> None:
     """A lane with an exit code other than 0 fails the run; all other lanes still run, and the output has the code."""
     bad = LaneSpec("bad", (shell("echo '== 1 passed in 0.10s =='; exit 3"),), 1)
-    good = LaneSpec("good", (shell("echo '== 1 passed in 0.10s =='"),), 1, meanwhile=(bad,) if meanwhile else ())
+    good = LaneSpec("good", (shell("echo '== 1 passed in 0.10s =='"),), 1, meanwhile=bad if meanwhile else None)
     code, output = run(*([good] if meanwhile else [bad, good]))
     assert code == 1
     assert "ended with 3" in output

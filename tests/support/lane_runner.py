@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -53,11 +52,10 @@ class LaneOutcome:
 class RunningLane:
     """The commands of a lane, run sequentially, with their output in a file."""
 
-    def __init__(
-        self, spec: LaneSpec, folder: Path, *, niceness: int = 0, may_start: Callable[[], bool] = lambda: True
-    ) -> None:
+    def __init__(self, spec: LaneSpec, folder: Path, *, niceness: int = 0, beside: RunningLane | None = None) -> None:
         self.spec = spec
-        self._may_start = may_start
+        self._beside = beside
+        """This lane starts with the last command of that one."""
         self._niceness = niceness
         self._waiting_commands = list(spec.commands)
         self._command = ""
@@ -80,7 +78,7 @@ class RunningLane:
 
     def poll(self) -> None:
         """Check the running command, start the next one, and end a lane that exceeds its time limit."""
-        if not self.running or (self._began_ns is None and not self._may_start()):
+        if not self.running or (self._beside is not None and not self._beside.is_at_last_command):
             return
         now_ns = self._ended_ns = MachineClock().now().mono_ns
         if self._began_ns is None:
@@ -148,8 +146,8 @@ class RunningLane:
 def run_lanes(lanes: Sequence[LaneSpec], *, write: Write) -> int:
     """Run lanes in their order; return 0 if all passed, else 1.
 
-    Lanes that run at the same time as others (`meanwhile`) run one after the other, from the last command of their lane
-    on, and beside the lanes that follow. Their output is written at the end.
+    A lane that runs at the same time as others (`meanwhile`) starts with the last command of its lane, and goes on
+    beside the lanes that follow. Its output is written at the end.
     """
     in_turn: list[RunningLane] = []
     background: list[RunningLane] = []
@@ -159,7 +157,8 @@ def run_lanes(lanes: Sequence[LaneSpec], *, write: Write) -> int:
             for spec in lanes:
                 lane = RunningLane(spec, Path(folder))
                 in_turn.append(lane)
-                background += _background_lanes(lane, Path(folder))
+                if spec.meanwhile is not None:
+                    background.append(RunningLane(spec.meanwhile, Path(folder), niceness=LOW_PRIORITY, beside=lane))
                 _run_lane(lane, background, write)
             for lane in background:
                 _run_lane(lane, background, write)
@@ -169,18 +168,6 @@ def run_lanes(lanes: Sequence[LaneSpec], *, write: Write) -> int:
         outcomes = [lane.outcome() for lane in (*in_turn, *background)]
     write(f"\n{table(outcomes)}\n{closing_line(outcomes, (MachineClock().now().mono_ns - began_ns) / NS_PER_S)}\n")
     return int(any(outcome.failures for outcome in outcomes))
-
-
-def _background_lanes(lane: RunningLane, folder: Path) -> list[RunningLane]:
-    """Return the lanes that run at the same time as a lane, each of which starts when those before it have ended."""
-    lanes: list[RunningLane] = []
-
-    def may_start(number: int) -> bool:
-        return lane.is_at_last_command and not any(before.running for before in lanes[:number])
-
-    for number, spec in enumerate(lane.spec.meanwhile):
-        lanes.append(RunningLane(spec, folder, niceness=LOW_PRIORITY, may_start=partial(may_start, number)))
-    return lanes
 
 
 def _run_lane(lane: RunningLane, background: Sequence[RunningLane], write: Write) -> None:
