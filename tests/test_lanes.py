@@ -148,6 +148,11 @@ def run(*lanes: LaneSpec) -> tuple[int, str]:
     return run_lanes(lanes, write=output.append), "".join(output)
 
 
+def groups_by_session() -> bool:
+    setting = Path("/proc/sys/kernel/sched_autogroup_enabled")
+    return setting.exists() and setting.read_text().strip() == "1"
+
+
 def test_runner_adds_up_the_results_of_the_lanes() -> None:
     """If all lanes pass, the exit code is 0, their outputs appear in order, and the last line has the totals."""
     code, output = run(
@@ -176,6 +181,15 @@ def test_a_lane_at_the_same_time_starts_with_the_last_command(tmp_path: Path) ->
     code, output = run(LaneSpec("kernel", (first, shell(f"until test -e {began}; do sleep 0.1; done")), 1, other))
     assert code == 1
     assert output.count("ended with") == output.count("ended with 4") == 1
+
+
+@pytest.mark.skipif(not groups_by_session(), reason="this kernel does not group processes by session")
+def test_a_lane_at_the_same_time_gives_way_to_other_sessions() -> None:
+    """The group of processes of a lane that runs at the same time as another has the lowest priority, too."""
+    other = LaneSpec("full", (shell("sleep 0.2; cat /proc/self/autogroup"),), 1)
+    code, output = run(LaneSpec("kernel", (shell("cat /proc/self/autogroup"),), 1, meanwhile=other))
+    assert code == 0
+    assert re.findall(r"/autogroup-\d+ nice (\d+)", output) == ["0", "19"]
 
 
 def test_a_lane_at_the_same_time_goes_on_beside_the_next_lanes(tmp_path: Path) -> None:

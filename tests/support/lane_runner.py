@@ -101,7 +101,7 @@ class RunningLane:
     def _start(self, command: tuple[str, ...]) -> subprocess.Popen[bytes]:
         self._command = " ".join([Path(command[0]).name, *command[1:]])
         with self._output.open("ab") as output:
-            return subprocess.Popen(
+            process = subprocess.Popen(
                 ["nice", "-n", str(self._niceness), *command] if self._niceness else command,
                 stdin=subprocess.DEVNULL,
                 stdout=output,
@@ -110,6 +110,11 @@ class RunningLane:
                 cwd=REPOSITORY,
                 env={**os.environ, "LAVT_PROGRESS": str(self._progress)},
             )
+        if self._niceness:
+            # Each lane is a session. If the kernel groups processes by session, `nice` has no effect between groups.
+            with suppress(OSError):
+                Path(f"/proc/{process.pid}/autogroup").write_text(str(self._niceness))
+        return process
 
     def end(self) -> None:
         """End the lane and all its processes, first as Ctrl-C does, so that pytest reports the failures so far."""
