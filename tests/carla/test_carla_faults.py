@@ -17,13 +17,14 @@ import pytest
 from tests.carla.contract_vehicle import blind_settings, server_config
 from tests.carla.stand_in import REPOSITORY, StandIn, free_tcp_pair, need_carla, stand_in
 
-from lavt.assembly.vehicles import build_carla, carla_settings
+from lavt.assembly.vehicles import VehicleSetup, build_carla, carla_settings
 from lavt.config import ServerCameraConfig, ServerConfig
 from lavt.domain import NS_PER_S, Actuation, Now
 from lavt.errors import UserError, VehicleError
 from lavt.vehicle.carla import connection, library, session
 from lavt.vehicle.carla.session import BRAKED, CarlaSession
 from lavt.vehicle.sim.road.road import load_road
+from lavt.vehicle.vehicle import Vehicle
 
 pytestmark = pytest.mark.full
 
@@ -230,15 +231,22 @@ def camera_server() -> Iterator[StandIn]:
         yield started
 
 
-def test_a_camera_that_another_client_destroyed_ends_the_run(camera_server: StandIn) -> None:
-    """Without its camera the car cannot be driven: the next picture fails with a sentence, not with a wait forever."""
-    setup = build_carla(pictured_config(camera_server.port))
+@contextmanager
+def first_picture(port: int) -> Iterator[tuple[VehicleSetup, Vehicle]]:
+    """Open a car with a camera, and take its first picture; close the car at the end."""
+    setup = build_carla(pictured_config(port))
     assert setup.start is not None
     with contextlib.ExitStack() as opened:
         opened.callback(setup.close)
         vehicle = setup.start(Now(0, 0))
         vehicle.advance(NS_PER_S)
         assert setup.camera.capture(1, NS_PER_S, None) is not None
+        yield setup, vehicle
+
+
+def test_a_camera_that_another_client_destroyed_ends_the_run(camera_server: StandIn) -> None:
+    """Without its camera the car cannot be driven: the next picture fails with a sentence, not with a wait forever."""
+    with first_picture(camera_server.port) as (setup, vehicle):
         assert camera_server.ask("destroy", "sensor.camera.rgb") == "True"
         vehicle.advance(2 * NS_PER_S)
         with pytest.raises(VehicleError, match="the camera is gone"):
@@ -347,13 +355,7 @@ def test_a_late_first_picture_is_awaited(camera_server: StandIn, monkeypatch: py
 
 def test_pictures_of_another_size_end_the_run(camera_server: StandIn) -> None:
     """Pictures that suddenly have another size are counted and never used; the run ends with both sizes named."""
-    setup = build_carla(pictured_config(camera_server.port))
-    assert setup.start is not None
-    with contextlib.ExitStack() as opened:
-        opened.callback(setup.close)
-        vehicle = setup.start(Now(0, 0))
-        vehicle.advance(NS_PER_S)
-        assert setup.camera.capture(1, NS_PER_S, None) is not None
+    with first_picture(camera_server.port) as (setup, vehicle):
         assert camera_server.ask("fault", "missing_rows", 1) == "set"
         vehicle.advance(2 * NS_PER_S)
         with pytest.raises(VehicleError, match="sends pictures of 320x239 pixels instead of 320x240"):

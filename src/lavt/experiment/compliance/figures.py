@@ -63,11 +63,14 @@ def _finite_p99(ramps: Ramps) -> float:
 
 
 def drive_figure(drive: DriveCompliance, limit_ms: float) -> Figure:
-    """Return the figure of one drive over time: frame age and two-way latency, and speed with the allowed speed."""
+    """Return the figure of one drive over time: frame age and two-way latency, and speed with the allowed speed.
+
+    The latencies are lower bounds, as in `exceedance_figure`.
+    """
     figure = new_figure(3.4)
     ages, speeds = figure.subplots(2, 1, sharex=True)
     low, _ = drive.age_ns
-    _, two_way = drive.two_way_ns
+    two_way, _ = drive.two_way_ns
     for ramps, style in ((low, {"color": "#0072b2"}), (two_way, {"color": "#009e73", "linestyle": "--"})):
         time_s, value_ms = _curve(ramps)
         ages.plot(time_s, value_ms / NS_PER_MS, linewidth=0.8, **style)

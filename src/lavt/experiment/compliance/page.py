@@ -43,7 +43,8 @@ def _first_parts(fleet: FleetCompliance, content: tables.Content, out: Path) -> 
         "exceedance",
         exceedance_figure(drives, colours, limit_ms),
         "share of time above a latency",
-        "Share of the commanded time in which the latency was above the value on the horizontal axis, by condition.",
+        "Share of the commanded time in which the latency was above the value on the horizontal axis, by condition. "
+        "Both figures show the lower bounds.",
     )
     over_time = save_figure(
         out,

@@ -112,10 +112,7 @@ def excess(blind_m: tuple[Ramps, Ramps], speeds: SpeedReports, nominal_mps: floa
 
 def _scaled(ramps: Ramps, factors: FloatArray) -> Ramps:
     with np.errstate(invalid="ignore"):  # an unknown age of a vehicle that is certainly stationary
-        first, last = (
-            np.where(factors > 0, np.where(factors > 0, values * factors, 0.0), 0.0)
-            for values in (ramps.first, ramps.last)
-        )
+        first, last = (np.where(factors > 0, values * factors, 0.0) for values in (ramps.first, ramps.last))
     is_infinite = ~np.isfinite(first) | ~np.isfinite(last)
     return Ramps(ramps.begin, ramps.end, np.where(is_infinite, np.inf, first), np.where(is_infinite, np.inf, last))
 

@@ -59,16 +59,7 @@ def plan_run(
     requested = config.network.requested(condition(config.network.condition))
     check_names(config.vehicle, config.controller)
     check_detector(config.perception.detector)
-    if config.fidelity == "geometry" and config.perception.settings:
-        raise UserError(
-            "fidelity geometry has no pictures for a detector: leave out perception.detector, or choose fidelity "
-            "pixels or video"
-        )
-    if config.fidelity != "geometry" and (config.vehicle.lane_noise_m or config.vehicle.lane_noise_rad):
-        raise UserError(
-            "vehicle.lane_noise_m and vehicle.lane_noise_rad are noise of a lane without pictures: leave them out, or "
-            "choose fidelity geometry"
-        )
+    _check_fidelity(config)
     _check_injection(config, requested)
     is_unimpaired = config.network.inherent == "loopback" and requested == NO_CONDITION
     if config.time == "real" and config.network.injection == "none" and not is_unimpaired:
@@ -120,6 +111,20 @@ def injected_entry(requested: Condition) -> dict[str, Any]:
     """
     least_entry = {} if requested.least_ms == requested.constant_ms else {"injected_least_ms": requested.least_ms}
     return {"injected_ms": requested.constant_ms, **least_entry}
+
+
+def _check_fidelity(config: RunConfig) -> None:
+    """Raise `UserError` for a detector without pictures, or noise of a lane with pictures."""
+    if config.fidelity == "geometry" and config.perception.settings:
+        raise UserError(
+            "fidelity geometry has no pictures for a detector: leave out perception.detector, or choose fidelity "
+            "pixels or video"
+        )
+    if config.fidelity != "geometry" and (config.vehicle.lane_noise_m or config.vehicle.lane_noise_rad):
+        raise UserError(
+            "vehicle.lane_noise_m and vehicle.lane_noise_rad are noise of a lane without pictures: leave them out, or "
+            "choose fidelity geometry"
+        )
 
 
 def _check_injection(config: RunConfig, requested: Condition) -> None:
