@@ -561,4 +561,5 @@ def test_a_second_interrupt_of_a_sweep_restores_the_loopback(tmp_path: Path) -> 
 
     assert "4c02" in with_delay, "".join(printed) + rest
     assert sweep.returncode == 1
+    assert "which has died: the interface is restored" in rest
     assert command("tc -j qdisc show dev lo") == before

@@ -41,7 +41,8 @@ def wait_for(file: Path) -> int:
 
 
 def begin_and_wait(directory: Path) -> int:
-    """Write the file `begun`, and wait for the file `never`."""
+    """Write the file `begun`, and wait for the file `never`; hold memory, so that the process dies slowly."""
+    _held = b"x" * 300_000_000
     (directory / "begun").touch()
     return wait_for(directory / "never")
 
@@ -95,7 +96,7 @@ def test_after_ctrl_c_no_further_call_begins(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not CAN_BLOCK_SIGNALS, reason="no thread can be sent a signal")
 def test_a_second_ctrl_c_breaks_off_the_call(tmp_path: Path) -> None:
-    """Ctrl-C while the executor waits for a call in progress kills the call's process; no other call begins."""
+    """Ctrl-C during the wait for a call kills the call's process and waits until it is dead; no other call begins."""
 
     def interrupt_the_wait(main_thread: int) -> None:
         for file in ("begun", "waiting"):
@@ -105,10 +106,13 @@ def test_a_second_ctrl_c_breaks_off_the_call(tmp_path: Path) -> None:
     interrupter = threading.Thread(target=interrupt_the_wait, args=(threading.get_ident(),))
     interrupter.start()
     with suppress(KeyboardInterrupt), WorkerProcesses(1) as executor:
+        worker = executor.submit(os.getpid).result(60)
         calls = [executor.submit(begin_and_wait, tmp_path) for _ in range(2)]
         wait_for(tmp_path / "begun")
         (tmp_path / "waiting").touch()
         executor.shutdown(cancel_futures=True)
+    with pytest.raises(ProcessLookupError):
+        os.kill(worker, 0)
     interrupter.join()
     assert isinstance(calls[0].exception(60), BrokenExecutor)
     assert calls[1].cancelled()

@@ -43,10 +43,12 @@ def uses_netem(planned: PlannedRun) -> bool:
     return planned.config.time == "real" and planned.config.network.injection == "netem"
 
 
-def restore_abandoned(planned: Iterable[PlannedRun]) -> None:
-    """Restore the loopback interface if netem delayed one of these runs, and its process was killed before it could."""
-    if any(map(uses_netem, planned)):
-        NetemInterface(LOOPBACK).restore()
+def restore_abandoned(planned: Iterable[PlannedRun]) -> list[str]:
+    """Restore the loopback interface if netem delayed one of these runs, and its process was killed before it could.
+
+    Returns a message for each process whose impairment was found.
+    """
+    return NetemInterface(LOOPBACK).restore() if any(map(uses_netem, planned)) else []
 
 
 class NetemRun:

@@ -84,7 +84,8 @@ def run_all(
             for run in attempt_in_processes(progress.drive, todo, jobs):
                 progress.fail(run, "each of the processes that drove it died")
         finally:
-            restore_abandoned(todo)  # a second Ctrl-C kills the processes
+            for message in restore_abandoned(todo):  # a second Ctrl-C kills the processes
+                on_progress(message)
     elif todo:
         with cluster_workers(cluster_address, jobs) as workers:
             jobs = workers.jobs

@@ -140,8 +140,11 @@ class WorkerProcesses(Executor):
     def _break_off(self) -> None:
         self._is_broken_off = True
         self._threads.shutdown(wait=False, cancel_futures=True)
-        for worker in tuple(self._busy):
+        broken_off = tuple(self._busy)
+        for worker in broken_off:
             worker.kill()
+        for worker in broken_off:  # the threads do not wait for it: Ctrl-C in the wait for a thread marks it as ended
+            worker.join()
 
     def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
         """Wait for all calls; after an error or Ctrl-C in the `with` block, only for those in progress."""

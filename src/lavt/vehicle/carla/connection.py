@@ -245,12 +245,15 @@ def _find_weather(carla: Any, name: str) -> Any:
 
 
 def _remove_leftovers(carla: Any, world: Any, settings: CarlaSettings) -> None:
-    """Destroy the actors of a killed run: those with our role name, the newest first; brake a car that stays."""
+    """Destroy the actors of a killed run: those with our role name, the newest first; brake a car that stays.
+
+    The car is braked first: a control is not answered, and is lost if the process ends before another request is.
+    """
     ours = [actor for actor in world.get_actors() if actor.attributes.get("role_name") == settings.role_name]
     for actor in sorted(ours, key=lambda actor: actor.id, reverse=True):
+        if actor.type_id.startswith("vehicle."):
+            actor.apply_control(carla.VehicleControl(brake=1.0, hand_brake=True))
         if not actor.destroy():
-            if actor.type_id.startswith("vehicle."):
-                actor.apply_control(carla.VehicleControl(brake=1.0, hand_brake=True))
             raise VehicleError(
                 f"the CARLA server at {settings.address} did not remove {actor.type_id}, which a killed run left: "
                 "restart it"
