@@ -99,6 +99,17 @@ def test_several_sources_give_a_drawing_and_a_row_for_each(show: Show, capsys: p
     assert "road.png: confidence 0.00, no lane" in printed
 
 
+def test_an_unusable_file_loses_no_row(show: Show, capsys: pytest.CaptureFixture[str]) -> None:
+    """If a later file cannot be used, the sentences and rows of the earlier ones are kept."""
+    Path("more").mkdir()
+    cv2.imwrite("more/a.png", ROAD)
+    cv2.imwrite("more/b.png", ROAD[::2, ::2])
+    with pytest.raises(UserError, match=r"b\.png is 320 x 240"):
+        show("more", "--no-draw", "--csv", "rows.csv")
+    assert "a.png: confidence 0.00, no lane" in capsys.readouterr().out
+    assert Path("rows.csv").read_text().count("a.png,0,0.0,false") == 1
+
+
 def test_the_rows_are_printed_as_json(show: Show, capsys: pytest.CaptureFixture[str]) -> None:
     """With `--json`, the only output is a list of one object for each picture; `--no-draw` draws nothing."""
     show("road.png", "road.png", "--json", "--no-draw")

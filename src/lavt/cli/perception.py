@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain, repeat
+from itertools import chain
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Any
@@ -187,26 +188,30 @@ def show(
     if csv_file is not None and not csv_file.parent.is_dir():
         raise UserError(f"{csv_file.parent} is not a directory: create it, or name another file with --csv")
     files = find_sources(sources)
-    drawn: Iterator[Path | None] = repeat(None)
+    is_single = len(sources) == 1 and not sources[0].is_dir()
+    drawn = _draw_all(inspection, files, out, is_single=is_single) if draw else _detect_all(inspection, files)
     with console.interruptible():
-        if draw:
-            is_single = len(sources) == 1 and not sources[0].is_dir()
-            drawn = _draw_all(inspection, files, out, is_single=is_single)
-        else:
-            for file in files:
-                _only_detect(inspection, file)
-        for file, target in zip(files, drawn, strict=False):
-            if not as_json:
-                console.print_result(_sentence(file, inspection.rows, target))
-    if csv_file is not None:
-        write_rows(csv_file, inspection.rows)
-    if as_json:
-        console.print_json(inspection.rows)
+        try:
+            for file, target in zip(files, drawn, strict=False):
+                if not as_json:
+                    console.print_result(_sentence(file, inspection.rows, target))
+        finally:  # also if a file cannot be read, or after Ctrl-C
+            _give_rows(inspection.rows, csv_file, as_json=as_json)
 
 
-def _only_detect(inspection: _Inspection, file: Path) -> None:
-    for _ in inspection.detect(file, read_pictures(file).pictures):
-        pass
+def _give_rows(rows: Sequence[Row], csv_file: Path | None, *, as_json: bool) -> None:
+    """Write the rows into a file, and print them, as far as it is asked and there are any."""
+    if rows and csv_file is not None:
+        write_rows(csv_file, rows)
+    if rows and as_json:
+        console.print_json(rows)
+
+
+def _detect_all(inspection: _Inspection, files: Sequence[Path]) -> Iterator[None]:
+    """Detect the lanes of each file without drawing; yield None for each, in the place of an output."""
+    for file in files:
+        deque(inspection.detect(file, read_pictures(file).pictures), maxlen=0)
+        yield None
 
 
 def _draw_all(inspection: _Inspection, files: Sequence[Path], out: Path | None, *, is_single: bool) -> Iterator[Path]:
