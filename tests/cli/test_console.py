@@ -3,6 +3,7 @@ from __future__ import annotations
 import ast
 import errno
 import io
+import os
 import re
 import signal
 import subprocess
@@ -101,18 +102,23 @@ def test_an_ignored_hangup_stays_ignored() -> None:
         signal.signal(signal.SIGHUP, former_handler)
 
 
-def test_an_error_of_the_system_comes_with_advice(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    """An error of the operating system ends a command with exit code 1, the path and advice."""
+@pytest.mark.parametrize(
+    ("number", "advice", "code"), [(errno.ENOSPC, "free space", 1), (errno.EISDIR, "remove this directory", 2)]
+)
+def test_an_error_of_the_system_comes_with_advice(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, number: int, advice: str, code: int
+) -> None:
+    """An error of the operating system ends a command with the path and advice, and exit code 2 if a name is wrong."""
 
-    def fill_the_disk() -> None:
-        raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path))
+    def fail() -> None:
+        raise OSError(number, os.strerror(number), str(tmp_path))
 
     with pytest.raises(SystemExit) as exit_error:
-        console.run_command(fill_the_disk)
+        console.run_command(fail)
     message = capsys.readouterr().err
-    assert exit_error.value.code == 1
+    assert exit_error.value.code == code
     assert str(tmp_path) in message
-    assert "free space" in message
+    assert advice in message
 
 
 def test_a_result_that_cannot_be_printed_names_the_standard_output(monkeypatch: pytest.MonkeyPatch) -> None:

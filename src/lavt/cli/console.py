@@ -45,8 +45,12 @@ OS_REMEDIES = {
     errno.ENETUNREACH: "check the address and this machine's network",
     errno.EHOSTUNREACH: "check the address and the network",
     errno.EMFILE: "raise the limit of open files (`ulimit -n`)",
+    errno.EISDIR: "remove this directory, or name another place",
+    errno.ENOTDIR: "remove the file in the place of a directory, or name another place",
 }
 """What to do about an error of the operating system."""
+INPUT_ERRORS = (errno.EISDIR, errno.ENOTDIR)
+"""The errors of the operating system that are about a name in the input."""
 
 
 def print_message(text: str) -> None:
@@ -111,7 +115,7 @@ def run_command(command: Callable[[], None]) -> None:
     except OSError as error:  # such as a full disk or a missing permission that no check anticipated
         remedy = OS_REMEDIES.get(error.errno or 0)
         print_message(f"lavt: {error}" + (f": {remedy}" if remedy else ""))
-        raise SystemExit(1) from None
+        raise SystemExit(2 if error.errno in INPUT_ERRORS else 1) from None
 
 
 @contextmanager
