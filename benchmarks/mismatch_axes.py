@@ -99,6 +99,14 @@ AXES = {
         0,
         ("network.video.loss_burst_packets=5", "video.repair_packets=0"),
     ),
+    "trace": Axis(
+        "handover every 10 s, which delays the video by up to 160 ms more for 1 s",
+        settings=("network.video.trace=handover.csv",),
+    ),
+    "control_trace": Axis(
+        "handover every 10 s, which delays the control by up to 160 ms more for 1 s",
+        settings=("network.control.trace=handover.csv",),
+    ),
     "frame_rate": Axis("frame rate, Hz (tuned for 30)", "camera.rate_hz", (10, 15), 30),
     "position_noise": Axis("noise of the seen lane's position, m", "vehicle.lane_noise_m", (0.02, 0.05, 0.1, 0.2), 0),
     "direction_noise": Axis(
@@ -128,7 +136,7 @@ def axis_tables(axis: Axis, runs: Sequence[Mapping[str, Any]]) -> list[str]:
     values = sorted({value for _, _, value in cells if value is not None})
     lines = []
     for condition in dict.fromkeys(condition for condition, _, _ in cells):
-        lines += ["", f"| {condition} | {' | '.join(f'{value:g}' for value in values) or 'exact'} |"]
+        lines += ["", f"| {condition} | {' | '.join(f'{value:g}' for value in values) or axis.title} |"]
         lines += [f"|{'---|' * (1 + max(len(values), 1))}"]
         for kind in axis.kinds:
             row = [cells.get((condition, kind, value), NOTHING) for value in values or [axis.exact]]
