@@ -247,6 +247,8 @@ def draw(points: Sequence[Point]) -> Figure:
     grid = figure.subplots(-(-len(names) // columns), columns, squeeze=False, sharey=True)
     for axes, name in zip(grid.flat, names, strict=False):
         for kind, colour in zip(KINDS, COLOURS, strict=False):
+            if kind not in {point.kind for point in points}:
+                continue
             line = sorted(
                 by_value(point for point in points if (point.axis, point.kind) == (name, kind)),
                 key=lambda group: group[0].value,
