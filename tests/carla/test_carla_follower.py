@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import signal
+import sys
+from collections.abc import Callable
 from itertools import pairwise
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -17,11 +21,14 @@ from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, Now
 from lavt.errors import UserError, VehicleError
 from lavt.experiment.runs.plan import plan_run
+from lavt.operating_system import HANGUP
 from lavt.vehicle.carla import guard as guarding
+from lavt.vehicle.carla import guard_link
 from lavt.vehicle.carla.follower import CALIBRATION_TICKS, RESEND_NS, Follower
 from lavt.vehicle.carla.frames import FlatPose
+from lavt.vehicle.carla.guard_link import GuardLink
 from lavt.vehicle.carla.plausible import SentControls, checked
-from lavt.vehicle.carla.settings import CarlaEvent, Snapshot
+from lavt.vehicle.carla.settings import CarlaEvent, CarlaSettings, Snapshot
 from lavt.vehicle.carla.ticks import FULL_BRAKE, SILENCE_NS
 from lavt.vehicle.carla.world_time import WINDOW_NS, WorldTime
 
@@ -258,7 +265,11 @@ class RecordedBrake(guarding.CarBrake):
 
     def __init__(self) -> None:
         self.sent: list[tuple[float, bool]] = []
-        super().__init__(lambda steer, hand_brake: self.sent.append((steer, hand_brake)))
+        super().__init__(self._record)
+
+    def _record(self, steer: float, hand_brake: bool) -> bool:
+        self.sent.append((steer, hand_brake))
+        return True
 
 
 def guard_with(*texts: bytes) -> list[tuple[float, bool]]:
@@ -303,15 +314,97 @@ def test_the_guard_brakes_a_silent_process_and_goes_on(monkeypatch: pytest.Monke
     reading, writing = os.pipe()
     brakings = []
 
-    def send(steer: float, hand_brake: bool) -> None:
+    def send(steer: float, hand_brake: bool) -> bool:
         brakings.append((steer, hand_brake))
         if len(brakings) == 3:
             os.write(writing, b"<0.100000>" + guarding.FAREWELL)
+        return True
 
     guarding.guard(reading, guarding.CarBrake(send))
     assert brakings == [(guarding.TRIAL_STEER, False)] * 3
     for end in (reading, writing):
         os.close(end)
+
+
+def guard_ended_pipe(send: Callable[[float, bool], bool]) -> None:
+    """Run the guard's loop on a pipe that is closed without a farewell."""
+    reading, writing = os.pipe()
+    os.close(writing)
+    try:
+        guarding.guard(reading, guarding.CarBrake(send))
+    finally:
+        os.close(reading)
+
+
+@pytest.mark.parametrize(("unreached", "brakings"), [(5, 5 + guarding.LAST_BRAKINGS), (1000, guarding.MAX_UNREACHED)])
+def test_the_guard_brakes_until_the_server_answered(
+    monkeypatch: pytest.MonkeyPatch, unreached: int, brakings: int
+) -> None:
+    """Only brakings that the server answered count, and the last one pulls the hand brake; the tries are limited."""
+    monkeypatch.setattr(guarding, "pause", lambda _: None)
+    hand_brakes: list[bool] = []
+
+    def send(_: float, hand_brake: bool) -> bool:
+        hand_brakes.append(hand_brake)
+        return len(hand_brakes) > unreached
+
+    guard_ended_pipe(send)
+    assert len(hand_brakes) == brakings
+    assert hand_brakes.count(True) == (unreached < guarding.MAX_UNREACHED)
+
+
+def test_the_guard_outlives_the_signals_of_a_service_manager(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The guard ignores SIGTERM, SIGHUP and SIGINT, which LAVT's process receives at the same time and handles."""
+    ignored: list[int] = []
+    monkeypatch.setattr(signal, "signal", lambda number, _: ignored.append(number))
+    monkeypatch.setattr(guarding, "load_library", Mock(side_effect=UserError("no wheel")))
+    monkeypatch.setattr(sys, "argv", ["guard", "127.0.0.1", "2000", "1.0", "24"])
+    assert guarding.main() == 1
+    assert {signal.SIGINT, signal.SIGTERM, *HANGUP} == set(ignored)
+
+
+class LostClient:
+    """A client whose connection is lost: what it sends is lost without an error, and no answer comes."""
+
+    def __init__(self, *, is_lost: bool) -> None:
+        self.is_lost = is_lost
+        self.arrived: list[str] = []
+
+    def get_server_version(self) -> str:
+        """Return the version, or raise the package's error."""
+        if self.is_lost:
+            raise RuntimeError("time-out")
+        return "0.9.16"
+
+
+def test_the_guard_connects_anew_after_a_failure() -> None:
+    """A braking whose answer does not come is not counted; the next one goes over a new connection."""
+    clients = [LostClient(is_lost=True), LostClient(is_lost=False)]
+    waiting: list[LostClient | UserError] = [clients[0], UserError("no server"), clients[1]]
+
+    def connect_client() -> LostClient:
+        following = waiting.pop(0)
+        if isinstance(following, UserError):
+            raise following
+        return following
+
+    link = GuardLink(connect_client)
+    assert [link.reach(lambda client: client.arrived.append("brake")) for _ in range(3)] == [False, False, True]
+    assert clients[1].arrived == ["brake"]
+    with pytest.raises(RuntimeError, match="time-out"):  # so that LAVT's process, which may have lost its own, ends
+        link.ask()
+
+
+def test_the_guard_does_not_touch_the_cars_of_another_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that was restarted, or has loaded a town, may have given the car's number to another client's car."""
+    episodes = iter([7, 7, 8])
+    monkeypatch.setattr(guard_link, "connect", lambda *_: Mock())
+    monkeypatch.setattr(guard_link, "ask_episode", lambda *_: next(episodes))
+    connect_client = guard_link.connector(None, CarlaSettings("127.0.0.1", 2000, 0.1, None))
+    connect_client()
+    connect_client()
+    with pytest.raises(VehicleError, match="another world"):
+        connect_client()
 
 
 def test_a_guard_that_does_not_reach_the_car_is_noticed() -> None:

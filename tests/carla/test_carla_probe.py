@@ -18,7 +18,7 @@ from tests.carla.stand_in import free_tcp_pair
 from lavt.cli.main import main
 from lavt.config_file import shipped
 from lavt.vehicle.carla import library, probe
-from lavt.vehicle.carla.probe import NoServerError, ask_version
+from lavt.vehicle.carla.probe import NoServerError, ask_episode, ask_version
 
 ANSWER = msgspec.msgpack.encode([1, 1, None, [[1, "0.9.16"]]])
 
@@ -57,6 +57,13 @@ def ask(*parts: bytes, timeout_s: float = 20.0, stays: bool = False) -> str | No
 def test_a_server_says_its_version(parts: tuple[bytes, ...]) -> None:
     """The version is read, however the answer is divided, and without waiting for the end of the connection."""
     assert ask(*parts, stays=True) == "0.9.16"
+
+
+@pytest.mark.parametrize(("result", "episode"), [([[1, [7, [b"token"]]]], 7), ([[0, ["busy"]]], None)])
+def test_a_server_says_its_episode(result: object, episode: int | None) -> None:
+    """The number of the server's world is read; an error of the server gives none."""
+    with answering(msgspec.msgpack.encode([1, 0, None, result])) as port:
+        assert ask_episode("127.0.0.1", port, 20.0) == episode
 
 
 def test_an_unknown_form_of_answer_is_left_to_the_package() -> None:

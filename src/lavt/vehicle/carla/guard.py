@@ -2,7 +2,8 @@
 
 The server keeps the last control of a client that is gone, so only another client can brake the car. LAVT's process
 writes into the guard's standard input all the time. If that stops, the guard brakes until it goes on; if the pipe is
-closed without a farewell, the guard brakes for some seconds, and the server keeps the brake.
+closed without a farewell, the guard brakes for some seconds, and the server keeps the brake. If the guard loses its
+connection, it connects anew, because the process may have lost its own at the same time.
 
 A state that the package `carla` cannot read aborts each process that reads the world's states. So the guard reads none:
 it gets the steer to keep from LAVT's process, and sends its controls with `apply_batch`, which needs no world.
@@ -13,6 +14,7 @@ from __future__ import annotations
 import os
 import re
 import select
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -22,7 +24,8 @@ from typing import Final
 from lavt.clock import Clock, MachineClock, pause
 from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, VehicleError
-from lavt.vehicle.carla.connection import connect
+from lavt.operating_system import HANGUP
+from lavt.vehicle.carla.guard_link import GuardLink, connector
 from lavt.vehicle.carla.library import load_library
 from lavt.vehicle.carla.settings import CarlaSettings
 
@@ -40,14 +43,19 @@ BEAT_TIMEOUT_S: Final = 0.3
 hangs."""
 REPEAT_S: Final = 0.1
 LAST_BRAKINGS: Final = 100
-"""After the death of the process, the guard brakes this often; with the last one it pulls the hand brake."""
+"""After the death of the process, the guard brakes this often; with the last one it pulls the hand brake. Only those
+count after which the server answered."""
+MAX_UNREACHED: Final = 60
+"""After the death of the process, the guard looks so often for a server that does not answer: one to four minutes."""
+LOOK_AGAIN_S: Final = 1.0
+IGNORED_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, *HANGUP)
+"""The guard ends after LAVT's process, and not before it, although a service manager sends both the same signal."""
 START_TIMEOUT_S: Final = 30.0
 END_TIMEOUT_S: Final = 2.0
 MAX_UNANSWERED: Final = 150
 """The guard answers what it reads. After so many beats without an answer, one to three seconds, it is not there."""
 CALL_NS: Final = NS_PER_S
 """The guard asks the server something this often, because a lost connection shows only in an answer."""
-CALL_TIMEOUT_S: Final = 1.0
 
 
 class Guard:
@@ -117,7 +125,8 @@ class Guard:
 def guard(beats: int, brake: CarBrake, answer: Callable[[], None] = lambda: None) -> None:
     """Brake while nothing can be read from the file descriptor `beats`; return after a farewell.
 
-    At the end of the pipe, brake `LAST_BRAKINGS` times, and return. `answer` is called after each reading.
+    At the end of the pipe, brake `LAST_BRAKINGS` times, and return; give up after `MAX_UNREACHED` brakings that did not
+    reach the car. `answer` is called after each reading.
     """
     timeout_s = BEAT_TIMEOUT_S
     while True:
@@ -134,9 +143,11 @@ def guard(beats: int, brake: CarBrake, answer: Callable[[], None] = lambda: None
         brake.read_steer(text)
         answer()
         timeout_s = BEAT_TIMEOUT_S
-    for count in range(1, LAST_BRAKINGS + 1):
-        brake(hand_brake=count == LAST_BRAKINGS)
-        pause(round(REPEAT_S * NS_PER_S))
+    braked = unreached = 0
+    while braked < LAST_BRAKINGS and unreached < MAX_UNREACHED:
+        is_reached = brake(hand_brake=braked == LAST_BRAKINGS - 1)
+        braked, unreached = braked + is_reached, unreached + (not is_reached)
+        pause(round((REPEAT_S if is_reached else LOOK_AGAIN_S) * NS_PER_S))
 
 
 def await_trial(next_steering_rad: Callable[[], float], max_steering_rad: float) -> None:
@@ -172,9 +183,12 @@ class BeatAnswer:
 
 
 class CarBrake:
-    """The brake of an actor, which `send` gives a control; each call brakes once."""
+    """The brake of an actor, which `send` gives a control; each call brakes once.
 
-    def __init__(self, send: Callable[[float, bool], None]) -> None:
+    `send` returns whether the server answered afterwards.
+    """
+
+    def __init__(self, send: Callable[[float, bool], bool]) -> None:
         self._send = send
         self._steer = TRIAL_STEER
 
@@ -183,28 +197,30 @@ class CarBrake:
         if steers := STEER.findall(beats):
             self._steer = float(steers[-1])
 
-    def __call__(self, *, hand_brake: bool = False) -> None:
-        """Brake with the wheels where they were commanded."""
-        self._send(self._steer, hand_brake)
+    def __call__(self, *, hand_brake: bool = False) -> bool:
+        """Brake with the wheels where they were commanded; return whether the control reached the server."""
+        return self._send(self._steer, hand_brake)
 
 
 def main() -> int:
     """Guard the car with the actor number of the arguments; return the exit code."""
+    for signal_number in IGNORED_SIGNALS:
+        signal.signal(signal_number, signal.SIG_IGN)
     host, port, timeout_s, number = sys.argv[1:]
     try:
         carla = load_library()
-        client = connect(carla, CarlaSettings(host, int(port), 0.1, None, timeout_s=float(timeout_s)))
-        client.set_timeout(CALL_TIMEOUT_S)
+        link = GuardLink(connector(carla, CarlaSettings(host, int(port), 0.1, None, timeout_s=float(timeout_s))))
 
-        def send(steer: float, hand_brake: bool) -> None:
+        def send(steer: float, hand_brake: bool) -> bool:
             control = carla.VehicleControl(throttle=0.0, steer=steer, brake=1.0, hand_brake=hand_brake)
-            client.apply_batch([carla.command.ApplyVehicleControl(int(number), control)])
+            braking = [carla.command.ApplyVehicleControl(int(number), control)]
+            return link.reach(lambda client: client.apply_batch(braking))
 
         brake = CarBrake(send)
         brake(hand_brake=True)
         os.write(sys.stdout.fileno(), READY)
-        guard(sys.stdin.fileno(), brake, BeatAnswer(client.get_server_version, MachineClock(), sys.stdout.fileno()))
-    except (LavtError, RuntimeError):  # the server is gone, and with it the car
+        guard(sys.stdin.fileno(), brake, BeatAnswer(link.ask, MachineClock(), sys.stdout.fileno()))
+    except (LavtError, RuntimeError, OSError):  # no server at the start, its world is another one, or LAVT has ended
         return 1
     return 0
 
