@@ -51,9 +51,9 @@ SEARCHED = (
     "jitter",
     "control_jitter",
     "loss",
-    "bursts",
     *DEPARTURES,
 )
+"""The axes that are searched: not `bursts`, because the vehicle stops in a long burst, which ends each oscillation."""
 SEARCHED_KINDS = ("predictive", "scheduled_lookahead", "lane_keeper")
 """Without `smith`: by the model, it is stable up to 2.8 s on all these axes but one, and no drive can be delayed so
 long."""

@@ -30,7 +30,7 @@ def test_every_axis_has_its_exact_value() -> None:
     for name, kind in zip(SEARCHED, cycle(SEARCHED_KINDS), strict=False):
         config = config_of(Place(name, kind, values_of(name)[0], 2))
         assert (config.controller.kind, config.seed, config.fidelity) == (kind, 2, "geometry")
-    assert config_of(Place("bursts", "predictive", 0.1, 1)).network.video.loss_burst_packets == 5
+    assert config_of(Place("loss", "predictive", 0.1, 1)).video.repair_packets == 0
 
 
 def test_a_search_continues_and_no_config_is_searched_twice(tmp_path: Path) -> None:
