@@ -98,6 +98,8 @@ def test_options_of_a_reset_replace_the_draws() -> None:
         ({"video_ms": (300, 20)}, {}, "video_ms"),
         ({}, {"delay": 5}, "no option 'delay'"),
         ({}, {"video_ms": -1.0}, "delay_ms"),
+        ({"changes": "vehicle.scenery=none"}, {}, "give a list of texts"),
+        ({"changes": (3,)}, {}, "give a list of texts"),
         ({}, {"route": "nowhere"}, "nowhere"),
     ],
 )
@@ -105,6 +107,13 @@ def test_wrong_settings_are_one_sentence(settings: dict[str, Any], options: dict
     """A wrong setting or option raises a `UserError` that names it."""
     with pytest.raises(UserError, match=message):
         plans(1, options, **settings)
+
+
+@pytest.mark.parametrize("name", ["video_ms", "control_ms"])
+def test_both_ends_of_a_range_are_checked(name: str) -> None:
+    """A range whose largest delay is not allowed is rejected before the first episode, not when it is drawn."""
+    with pytest.raises(UserError, match="60000"):
+        planner(**{name: (0, 60001)})
 
 
 @pytest.mark.parametrize(("value", "expected"), [("a", ("a",)), (["a", "b"], ("a", "b")), (None, ("d",))])
@@ -120,13 +129,15 @@ def test_other_values_are_no_names(value: Any) -> None:
         parse_names("route", value, "d")
 
 
-@pytest.mark.parametrize(("value", "expected"), [(None, None), (5, (5.0, 5.0)), ([1, 2.5], (1.0, 2.5))])
+@pytest.mark.parametrize(
+    ("value", "expected"), [(None, None), (5, (5.0, 5.0)), ([1, 2.5], (1.0, 2.5)), (np.int64(5), (5.0, 5.0))]
+)
 def test_a_range_is_a_delay_or_a_pair(value: Any, expected: tuple[float, float] | None) -> None:
     """A single delay is a range of one value."""
     assert parse_range_ms("video_ms", value) == expected
 
 
-@pytest.mark.parametrize("value", [-1, "5", (1, 2, 3), (2, 1), float("nan"), (0, float("inf")), True])
+@pytest.mark.parametrize("value", [-1, "5", (1, 2, 3), (2, 1), float("nan"), (0, float("inf")), True, 10**400])
 def test_other_values_are_no_range(value: Any) -> None:
     """A negative delay, a reversed pair, and anything but finite numbers is rejected."""
     with pytest.raises(UserError, match="video_ms"):

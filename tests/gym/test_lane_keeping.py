@@ -83,6 +83,8 @@ def test_make_registers_and_describes_the_spaces(make: Make) -> None:
         ({"max_cross_track_m": -1}, "max_cross_track_m"),
         ({"action_history": -1}, "action_history"),
         ({"reward": {"speed": 1}}, "'speed'"),
+        ({"reward": 3}, "reward is 3"),
+        ({"steering_scale_rad": 10**400}, "steering_scale_rad"),
         ({"records": "src"}, "not an empty directory"),
     ],
 )
@@ -115,7 +117,7 @@ def test_calls_in_the_wrong_order_are_errors(make: Make) -> None:
             call()
 
 
-@pytest.mark.parametrize("action", [0.0, [], [0.0, 0.0], [np.nan], [np.inf], ["left"], None])
+@pytest.mark.parametrize("action", [0.0, [], [0.0, 0.0], [np.nan], [np.inf], ["left"], [10**400], None])
 def test_invalid_actions_are_errors(make: Make, action: Any) -> None:
     """An action of another shape, or one that is not finite, is an error and drives nothing."""
     env = make()
@@ -281,7 +283,7 @@ def test_an_outage_ends_an_episode_by_a_safe_stop(make: Make) -> None:
 @pytest.mark.full
 def test_a_vehicle_that_is_never_armed_is_an_error(make: Make) -> None:
     """With pictures that are older than the gate allows, the reset raises the reason."""
-    with pytest.raises(WorkError, match="never armed"):
+    with pytest.raises(WorkError, match="a picture that is too old"):
         make(video_ms=700).reset(seed=1)
 
 

@@ -31,6 +31,8 @@ class DriveWatcher:
         """The first accepted command from the newest picture of which a command was accepted."""
         self.rejections = 0
         """The number of rejected commands since the client knows that the vehicle is armed."""
+        self.rejection = ""
+        """The reason of the newest rejection."""
         self.route: Route | None = None
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (part of the protocol)
@@ -46,6 +48,7 @@ class DriveWatcher:
                 self.applied = payload
             else:
                 self.rejections += 1
+                self.rejection = payload.reason
         elif topic == "route":
             self.route = payload
 
@@ -101,7 +104,11 @@ class AgentDrive:
             if session.phase == "stopped":
                 break
             self._deliver(*waiting(self.view))
-        raise WorkError(f"the vehicle was never armed: {session.reason or 'the client saw no picture'}")
+        rejection = self._watcher.rejection
+        reason = session.reason or (
+            f"commands were rejected: {rejection}" if rejection else "the client saw no picture"
+        )
+        raise WorkError(f"the vehicle was never armed: {reason}")
 
     @property
     def view(self) -> AgentView:

@@ -51,6 +51,9 @@ class EpisodePlanner:
         video_ms: Delay,
         control_ms: Delay,
     ) -> None:
+        changes = tuple(changes) if isinstance(changes, list | tuple) else changes
+        if not isinstance(changes, tuple) or not all(isinstance(change, str) for change in changes):
+            raise UserError(f"changes is {changes!r}: give a list of texts, such as ('vehicle.scenery=none',)")
         data = {} if config is None else read_yaml(find_file(Path(config)))
         source = "the environment" if config is None else str(config)
         self.base = build_config(
@@ -67,7 +70,10 @@ class EpisodePlanner:
         for name in self._routes:  # the first episode must not be the first to find an error
             self._plan({"vehicle.route": name}, "episode")
         for name in self._conditions:
-            self.plan(np.random.default_rng(0), {"condition": name}, "episode")
+            for ends in zip(*(limits or (None, None) for limits in self._delays_ms.values()), strict=True):
+                delays_ms = dict(zip(("video_ms", "control_ms"), ends, strict=True))
+                options = {option: delay_ms for option, delay_ms in delays_ms.items() if delay_ms is not None}
+                self.plan(np.random.default_rng(0), {"condition": name} | options, "episode")
 
     def plan(self, generator: np.random.Generator, options: Mapping[str, Any], name: str) -> PlannedRun:
         """Return the plan of the next episode; raise `UserError` for an unknown option or a wrong value."""

@@ -93,10 +93,10 @@ class LaneKeepingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             check_directory(self._records)
         self.render_mode = render_mode
         self._shows_pixels = observation == "pixels"
-        self._steering_scale_rad = steering_scale_rad
+        self._steering_scale_rad = float(steering_scale_rad)
         self._max_cross_track_m = max_cross_track_m
         self._speed_mps = self._planner.base.controller.effective_preset().speed_mps
-        self._actions: deque[NDArray[np.float32]] = deque(maxlen=action_history)
+        self._actions: deque[NDArray[np.float32]] = deque(maxlen=int(action_history))
         self._action_shape = (2 if controls_speed else 1,)
         self.action_space = spaces.Box(-1.0, 1.0, self._action_shape, np.float32)
         self._numbers = self._number_space(action_history)
@@ -174,7 +174,7 @@ class LaneKeepingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _valid_action(self, action: ArrayLike) -> NDArray[np.float32]:
         try:
             chosen = np.array(action, np.float32)
-        except (TypeError, ValueError) as error:
+        except (OverflowError, TypeError, ValueError) as error:
             raise InvalidAction(f"an action must be an array of numbers: {error}") from error
         if chosen.shape != self._action_shape or not np.isfinite(chosen).all():
             raise InvalidAction(f"an action must be finite and of shape {self._action_shape}, not {action!r}")

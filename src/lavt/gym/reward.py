@@ -29,13 +29,15 @@ class RewardWeights:
 
 def parse_weights(weights: Mapping[str, float] | None) -> RewardWeights:
     """Return the default weights, of which `weights` replaces some; raise `UserError` for a wrong name or value."""
+    if weights is not None and not isinstance(weights, Mapping):
+        raise UserError(f"reward is {weights!r}: give weights by name, such as {{'progress': 0.2}}")
     known = [field.name for field in fields(RewardWeights)]
     for name, weight in (weights or {}).items():
         if name not in known:
             raise UserError(f"there is no term {name!r} of the reward; choose among {', '.join(known)}")
         if not is_number(weight, 0.0):
             raise UserError(f"the weight of {name} is {weight!r}: give a finite number that is at least 0")
-    return RewardWeights(**(weights or {}))
+    return RewardWeights(**{name: float(weight) for name, weight in (weights or {}).items()})
 
 
 class RewardMeter:

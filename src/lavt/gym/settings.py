@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
+from numbers import Integral, Real
 from typing import Any
 
 from lavt.errors import UserError
 
 
 def is_number(value: Any, least: float = -math.inf) -> bool:
-    """Return whether a value is a finite number, not a truth value, and at least `least`."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and least <= value < math.inf
+    """Return whether a value is a finite number, also of numpy, not a truth value, and at least `least`."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    try:
+        return least <= float(value) < math.inf
+    except OverflowError:  # an integer beyond the largest float
+        return False
 
 
 def check_positive(name: str, value: Any) -> None:
@@ -21,7 +27,7 @@ def check_positive(name: str, value: Any) -> None:
 
 def check_count(name: str, value: Any, most: int) -> None:
     """Raise `UserError` unless the value is a whole number from 0 to `most`."""
-    if not isinstance(value, int) or not is_number(value, 0) or value > most:
+    if not isinstance(value, Integral) or not is_number(value, 0) or int(value) > most:
         raise UserError(f"{name} is {value!r}: give a whole number from 0 to {most}")
 
 
