@@ -246,14 +246,17 @@ def test_foreign_qdisc_is_rejected_and_left_alone(sides: dict[str, NetemInterfac
 @JUDGES_MEDIANS
 @pytest.mark.parametrize(
     ("distribution", "min_ms", "max_ms"),
-    [("normal", 9, 19), ("uniform", 7, 14), ("pareto", 4, 12), ("paretonormal", 4, 12)],
+    [("normal", 7.9, 20.3), ("uniform", 5.8, 14.1), ("pareto", 3.0, 15.4), ("paretonormal", 4.3, 14.7)],
 )
 def test_jitter_spreads_delays_in_order(
     sides: dict[str, NetemInterface], distribution: Any, min_ms: float, max_ms: float
 ) -> None:
-    """Under 10 ms of jitter the delays' interquartile range is that of the distribution, and no packet is reordered."""
+    """Under 10 ms of jitter the delays' interquartile range is that of the distribution, and no packet is reordered.
+
+    The limits are those that one of 100 000 samples of 100 packets in order exceeds, drawn from tc's tables.
+    """
     apply_to_video(
-        sides, Impairment(75, jitter_ms=5, jitter_distribution="pareto")
+        sides, Impairment(75, jitter_ms=1, jitter_distribution="pareto")
     )  # the next call must replace this distribution
     apply_to_video(sides, Impairment(75, jitter_ms=10, jitter_distribution=distribution))
     arrivals = send_flows([VIDEO_FLOW], 100, 30)["video"]
@@ -308,13 +311,16 @@ def test_loss_has_the_requested_share(sides: dict[str, NetemInterface]) -> None:
 
 
 def test_burst_loss_has_the_requested_length(sides: dict[str, NetemInterface]) -> None:
-    """With 10 % loss in bursts of 5, 5 to 16 % of 3000 packets are lost, in bursts of 3.3 to 7.5 on average."""
+    """With 10 % loss in bursts of 5, 4 to 17 % of 3000 packets are lost, in bursts of 3 to 8.1 on average.
+
+    One of 100 000 samples exceeds each limit.
+    """
     apply_to_video(sides, Impairment(10, loss=0.1, loss_burst_packets=5))
     arrivals = send_flows([VIDEO_FLOW], 3000, 1)["video"]
     lost = 3000 - len(arrivals.arrived)
 
-    assert 3.3 < fmean(burst_lengths(arrivals)) < 7.5
-    assert 150 < lost < 480
+    assert 3.0 < fmean(burst_lengths(arrivals)) < 8.1
+    assert 130 < lost < 520
 
 
 @JUDGES_MEDIANS
