@@ -106,7 +106,10 @@ class Point:
 
 
 def config_of(place: Place) -> RunConfig:
-    """Return the config of the drives of one search, with limits so wide that none depends on the delay."""
+    """Return the config of the drives of one search, with limits so wide that none depends on the delay.
+
+    Of the axis's settings it has those of the network; its routes and limits are for other roads.
+    """
     axis = AXES[place.axis]
     changes = [
         "vehicle.route=b_key",
@@ -195,10 +198,10 @@ def search_points(
     path.parent.mkdir(parents=True, exist_ok=True)
     if not path.exists():
         path.write_text(f"{','.join(COLUMNS)}\n")
-    same: defaultdict[str, list[Place]] = defaultdict(list)
+    same: defaultdict[tuple[bool, str], list[Place]] = defaultdict(list)
     for place in wanted:
         if place not in found:
-            same[f"{place.axis in DEPARTURES} {config_of(place).model_dump_json()}"].append(place)
+            same[place.axis in DEPARTURES, config_of(place).model_dump_json()].append(place)
     points = search_all([places[0] for places in same.values()])
     for places, point in zip(same.values(), points, strict=True):
         for place in places:

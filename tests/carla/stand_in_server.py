@@ -80,6 +80,12 @@ class Streams:
             subscriber.put(struct.pack("<I", len(data)) + data)
 
 
+def _described(control: list[Any]) -> str:
+    """Return throttle, brake and hand brake of a `VehicleControl`."""
+    throttle, _, brake, hand_brake, *_ = control
+    return f"{throttle} {brake} {hand_brake}"
+
+
 class StandInServer:
     """The methods of the protocol by name, on a world."""
 
@@ -176,9 +182,9 @@ class StandInServer:
                     self._pace = float(factor)
                     return "set"
                 case ["control", kind]:
-                    actor = next(actor for actor in world.actors.values() if actor.kind == kind)
-                    throttle, _, brake, hand_brake, *_ = actor.control
-                    return f"{throttle} {brake} {hand_brake}"
+                    return _described(next(actor for actor in world.actors.values() if actor.kind == kind).control)
+                case ["kept_control"]:
+                    return _described(world.kept_control)
                 case ["frame"]:
                     return str(world.frame)
                 case ["speed"]:

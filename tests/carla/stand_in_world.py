@@ -122,6 +122,8 @@ class StandInWorld:
         self._pictures = itertools.count()
         self._withheld: dict[int, int] = {}
         self.faults = Faults()
+        self.kept_control: list[Any] = []
+        """The control of an actor at the moment of the refusal to remove it."""
 
     @property
     def is_synchronous(self) -> bool:
@@ -185,6 +187,7 @@ class StandInWorld:
     def destroy(self, number: int) -> bool:
         """Remove an actor; return whether it existed and is not of the kind that is kept."""
         if number in self.actors and self.actors[number].kind == self.faults.kept_kind:
+            self.kept_control = self.actors[number].control
             return False
         self._cars.pop(number, None)
         self._renderers.pop(number, None)

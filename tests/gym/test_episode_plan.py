@@ -12,7 +12,7 @@ pytest.importorskip("gymnasium")
 from lavt.errors import UserError
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.gym.episode_plan import EpisodePlanner
-from lavt.gym.settings import check_count, check_positive, parse_names, parse_range_ms
+from lavt.gym.settings import check_count, check_positive, parse_changes, parse_names, parse_range_ms
 
 
 def planner(**settings: Any) -> EpisodePlanner:
@@ -107,6 +107,11 @@ def test_wrong_settings_are_one_sentence(settings: dict[str, Any], options: dict
     """A wrong setting or option raises a `UserError` that names it."""
     with pytest.raises(UserError, match=message):
         plans(1, options, **settings)
+
+
+def test_changes_are_any_iterable_of_texts() -> None:
+    """A generator gives the changes as a list does."""
+    assert parse_changes(text for text in ("seed=2",)) == parse_changes(["seed=2"]) == ("seed=2",)
 
 
 @pytest.mark.parametrize("name", ["video_ms", "control_ms"])

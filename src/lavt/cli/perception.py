@@ -200,7 +200,7 @@ def show(
 
 
 def _give_rows(rows: Sequence[Row], csv_file: Path | None, *, as_json: bool) -> None:
-    """Write the rows into a file, and print them, as far as it is asked and there are any."""
+    """Write the rows into `csv_file` if it is given, and print them if `as_json`; do nothing without rows."""
     if rows and csv_file is not None:
         write_rows(csv_file, rows)
     if rows and as_json:

@@ -12,7 +12,7 @@ from lavt.config import AGENT, RunConfig
 from lavt.config_file import build_config, find_file, parse_config, read_yaml
 from lavt.errors import UserError
 from lavt.experiment.runs.plan import PlannedRun, plan_run, with_changes
-from lavt.gym.settings import parse_names, parse_range_ms
+from lavt.gym.settings import parse_changes, parse_names, parse_range_ms
 
 OPTIONS: Final = {
     "route": "vehicle.route",
@@ -51,13 +51,10 @@ class EpisodePlanner:
         video_ms: Delay,
         control_ms: Delay,
     ) -> None:
-        changes = tuple(changes) if isinstance(changes, list | tuple) else changes
-        if not isinstance(changes, tuple) or not all(isinstance(change, str) for change in changes):
-            raise UserError(f"changes is {changes!r}: give a list of texts, such as ('vehicle.scenery=none',)")
         data = {} if config is None else read_yaml(find_file(Path(config)))
         source = "the environment" if config is None else str(config)
         self.base = build_config(
-            RunConfig, data, (*changes, f"controller.kind={AGENT}", f"fidelity={fidelity}"), source
+            RunConfig, data, (*parse_changes(changes), f"controller.kind={AGENT}", f"fidelity={fidelity}"), source
         )
         if self.base.time != "virtual":
             raise UserError(f"{source}: an environment is for virtual time only: leave out the key time")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any
 
@@ -29,6 +30,15 @@ def check_count(name: str, value: Any, most: int) -> None:
     """Raise `UserError` unless the value is a whole number from 0 to `most`."""
     if not isinstance(value, Integral) or not is_number(value, 0) or int(value) > most:
         raise UserError(f"{name} is {value!r}: give a whole number from 0 to {most}")
+
+
+def parse_changes(changes: Any) -> tuple[str, ...]:
+    """Return the changes of a config, which are an iterable of texts and not a text."""
+    is_list = isinstance(changes, Iterable) and not isinstance(changes, str)
+    listed = tuple(changes) if is_list else (None,)
+    if not all(isinstance(change, str) for change in listed):
+        raise UserError(f"changes is {changes!r}: give a list of texts, such as ('vehicle.scenery=none',)")
+    return listed
 
 
 def parse_names(option: str, names: Any, default: str) -> tuple[str, ...]:
