@@ -21,6 +21,7 @@ from lavt.experiment.analysis.latency import frame_age
 from lavt.experiment.analysis.metrics import driving_interval
 from lavt.experiment.compliance.criteria import ComplianceLimits
 from lavt.experiment.compliance.drive_compliance import DriveCompliance, evaluate_drive
+from lavt.experiment.compliance.figures import drive_figure
 from lavt.recording.record import Record, read_record
 from lavt.recording.table import Table, table_of
 
@@ -158,6 +159,16 @@ def test_a_driver_cannot_take_longer_than_the_loop() -> None:
     entry = evaluated(record(frame=frames, admission=commands, truth=STEADY)).entry
     assert entry["two_way_ms"]["max"] == pytest.approx((0.0, 190.0))
     assert entry["verdicts"]["two_way_above_share"] == "not decided"
+
+
+def test_the_figure_of_a_drive_shows_lower_bounds() -> None:
+    """If a client states an impossible time, the curve of the two-way latency is at its lower bound, 0."""
+    frames = [frame(number * 200, number * 200 - 10) for number in range(-1, 5)]
+    commands = [command(number * 200 + 180, number * 200, driver_ms=10_000) for number in range(-1, 5)]
+    drive = evaluated(record(frame=frames, admission=commands, truth=STEADY))
+    age, two_way, *_ = drive_figure(drive, 100.0).axes[0].get_lines()
+    assert np.nanmax(age.get_ydata()) == pytest.approx(390.0)
+    assert np.nanmax(two_way.get_ydata()) == 0.0
 
 
 def test_the_driver_takes_its_time() -> None:
