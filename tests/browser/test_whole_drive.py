@@ -29,7 +29,7 @@ pytestmark = pytest.mark.timeout(600)
 
 @contextmanager
 def excusing_load(stalls: Stalls) -> Iterator[None]:
-    """Excuse a drive that has not reached its end on a busy machine, where a browser pauses for too long."""
+    """Excuse a drive that was interrupted on a busy machine, where a browser pauses and the page loses the hand."""
     try:
         yield
     except AssertionError as failure:
@@ -45,15 +45,17 @@ def drive_to_the_goal(tab: AnyTab, drive: PersonDrive, condition: str, stalls: S
     tab.key(key, down=True)
     tab.key(key, down=False)
     wait_until("the delay is chosen", lambda: field(tab, "delay") == delays)
-    since_ns = MachineClock().now().mono_ns
+    driver, since_ns = KeyboardDriver(tab, SETTINGS), MachineClock().now().mono_ns
     with stalls.excusing_failures(since_ns, stall_ms=LONG_STALL_MS), excusing_load(stalls):
-        KeyboardDriver(tab, SETTINGS).drive(DRIVE_LIMIT_S)
+        driver.drive(DRIVE_LIMIT_S)
     drive.process.end()
     assert drive.process.popen.returncode == 0
     server, client = (read_record(drive.out / side / f"{side}.mcap") for side in ("server", "client"))
     entry = measure(server, client).entry
     with stalls.excusing_failures(since_ns, stall_ms=LONG_STALL_MS):
-        assert (entry["ending"], entry["lane_invasions"]) == ("completed", 0)
+        assert entry["lane_invasions"] == 0
+        with excusing_load(stalls):
+            assert entry["ending"] == "completed", f"the page lost the hand {driver.stops} times"
 
 
 def test_a_person_drives_a_route_in_chromium(person_drive: PersonDrive, stalls: Stalls) -> None:
