@@ -21,6 +21,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
+from lavt.transport import zenoh_link
 from lavt.transport.security.envelope import MAX_ENVELOPE_BYTES, MAX_RUN_REPLY_ENVELOPE_BYTES
 from lavt.transport.zenoh_config import SessionSettings
 from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, REPLY_CHANNELS, Router, ZenohLink, quiet_logs
@@ -367,6 +368,24 @@ def test_sides_that_are_routers_themselves() -> None:
                 exchange_all_kinds(server, server_received, client, received)
 
 
+@pytest.mark.parametrize("runs_only", [False, True])
+def test_a_client_begins_when_it_reaches_the_server(*, runs_only: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that is a router and finds a running server knows its queries when its start ends.
+
+    So its first request is not lost.
+    """
+    monkeypatch.setattr(zenoh_link, "FIRST_LINK_LIMIT_S", ARRIVAL_TIMEOUT_S)
+    port = free_port()
+    with (
+        closing(open_embedded("server", listening(port), vehicle="first")) as server,
+        closing(open_embedded("client", dialling(port), vehicle="first")) as client,
+    ):
+        server.start(Received(), answers_runs_only=runs_only)
+        client.start(Received(), queries_only=runs_only)
+        querier = client._session.declare_querier(f"lavt/first/{'run' if runs_only else 'session'}")
+        assert querier.matching_status.matching
+
+
 def test_an_embedded_router_whose_port_is_in_use() -> None:
     """A link that is a router raises a UserError that names the endpoint if its port is in use."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as occupant:
@@ -656,8 +675,13 @@ def test_both_routers_can_run_on_one_machine(security: str) -> None:
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.iterdir()))
 def test_shipped_configs_use_no_scouting(name: str) -> None:
-    """Every shipped config disables scouting by multicast and gossip, and Zenoh's timestamps."""
+    """Every shipped config disables scouting by multicast and gossip, and Zenoh's timestamps.
+
+    A router would wait at its start for the answers to scouting, so this wait is 0.
+    """
     config = zenoh.Config.from_file(str(CONFIGS / name))
+    if json.loads(config.get_json("mode")) == "router":
+        assert json.loads(config.get_json("scouting/delay")) == 0
     assert json.loads(config.get_json("scouting/multicast/enabled")) is False
     assert json.loads(config.get_json("scouting/gossip/enabled")) is False
     assert json.loads(config.get_json("timestamping/enabled")) is False

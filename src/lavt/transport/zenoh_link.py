@@ -40,6 +40,11 @@ Deliver = Callable[[str, Any, Now, Any], None]
 
 REPLY_TIMEOUT_S = 2.0
 RETRY_S = 1.0
+FIRST_LINK_LIMIT_S, FIRST_LINK_POLL_S = 0.5, 0.005
+"""How long a client whose session is a router waits at its start for the server, and how often it looks. On a fast
+network this takes 0.1 s, the time after which Zenoh's routers compute their routes."""
+OTHER_ROUTES_S = 0.02
+"""Time in which the server's router also has computed its routes, which it does not announce."""
 REPLY_CHANNELS = {"session": "session_reply", "netem": "netem_reply", "info": "info_reply", "run": "run_reply"}
 """The channel of the replies for each channel of queries. The channel of a query is the last part of its key."""
 DRIVE_QUERIES = ("session", "netem", "info")
@@ -229,6 +234,7 @@ class ZenohLink:
         self._waiting = waiting
         self._waiting_reason = ""
         self._check: RouterCheck | None = None
+        self._dials = settings.is_router and side == "client"
         if settings.is_router:
             self._session = _open_router(settings.path, settings.changes, must_listen=False)
             self._check = RouterCheck(partial(_router_reports, self._session))
@@ -258,6 +264,8 @@ class ZenohLink:
         """
         self._deliver = deliver
         self._answers_runs_only = answers_runs_only
+        if self._dials:
+            self._await_server()
         if queries_only:
             return
         if self._check is not None:
@@ -268,6 +276,17 @@ class ZenohLink:
             self._waiting(self._waiting_reason)
             self._opener = threading.Thread(target=self._open_later, name="zenoh opener", daemon=True)
             self._opener.start()
+
+    def _await_server(self) -> None:
+        """Wait for a server that answers queries, so that the first request is not lost; return without one, too."""
+        queriers = [self._session.declare_querier(f"{self._base}/{channel}") for channel in ("session", "run")]
+        for _ in range(round(FIRST_LINK_LIMIT_S / FIRST_LINK_POLL_S)):
+            if any(querier.matching_status.matching for querier in queriers):
+                self._closing.wait(OTHER_ROUTES_S)
+                break
+            self._closing.wait(FIRST_LINK_POLL_S)
+        for querier in queriers:
+            querier.undeclare()
 
     def _open_later(self) -> None:
         """Try to open the session until it succeeds; each attempt takes at most the config's open_timeout."""
