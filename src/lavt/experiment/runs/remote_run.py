@@ -43,6 +43,8 @@ from lavt.transport.zenoh_link import RouterUnreachable
 ATTEMPTS = 3
 """How often a run is driven at most, if the connection is lost or a part fails."""
 POLL_NS = 500 * NS_PER_MS
+READY_POLL_NS = 100 * NS_PER_MS
+"""How often to look whether a process of this machine is ready; nothing is measured yet."""
 RETRY_NS = 2 * NS_PER_S
 BUSY_LIMIT_S = LEASE_S + 15.0
 """How long to wait for the end of another run: so long that a run whose client has died is over."""
@@ -240,5 +242,5 @@ def _wait_ready(process: Process, keep_alive: Callable[[], Any]) -> dict[str, An
         if clock.now().mono_ns > until_ns:
             raise WorkError(f"{process.name} did not get ready within {READY_LIMIT_S:.0f} s")
         keep_alive()
-        pause(POLL_NS)
+        pause(READY_POLL_NS)
     return process.wait_ready()
