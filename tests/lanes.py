@@ -53,22 +53,26 @@ for the drives of these tests."""
 KERNEL = (sys.executable, "tests/kernel/run", *SHOW_SLOWEST)
 FULL = LaneSpec("full", (pytest("-m", "full", "--timeout=1800"),), 40)
 """A test has more time here, because the lane runs at the lowest priority beside others."""
-LINTERS = (
-    program("ruff", "check"),
-    program("ruff", "format", "--check"),
-    program("mypy"),
-    program("lint-imports"),
-    ("env", "NO_MKDOCS_2_WARNING=1", *program("mkdocs", "build", "--strict", "--quiet")),
+LINTERS = LaneSpec(
+    "linters",
+    (
+        program("ruff", "check"),
+        program("ruff", "format", "--check"),
+        program("mypy"),
+        program("lint-imports"),
+        ("env", "NO_MKDOCS_2_WARNING=1", *program("mkdocs", "build", "--strict", "--quiet")),
+    ),
+    15,
 )
 LANES = (
-    LaneSpec("linters", LINTERS, 10),
     LaneSpec("quick", (pytest(),), 15),
     LaneSpec("realtime", (pytest("-m", "realtime"),), 35),
     LaneSpec("field", (pytest("tests/field"),), 35),
     LaneSpec("kernel", ((*KERNEL, CAN_DRIVES), (*KERNEL, f"--ignore={CAN_DRIVES}")), 30, meanwhile=FULL),
     LaneSpec("interop", (pytest("tests/interop"),), 5),
-    LaneSpec("browser", (pytest("tests/browser"),), 10),
+    LaneSpec("browser", (pytest("tests/browser"),), 10, meanwhile=LINTERS),
 )
+ALL_LANES = (*LANES, *(lane.meanwhile for lane in LANES if lane.meanwhile is not None))
 
 
 def runs_in_parallel(marker_expression: str, arguments: Iterable[Path]) -> bool:
@@ -90,7 +94,7 @@ def write(text: str) -> None:
 
 def select_lanes(names: Sequence[str]) -> list[LaneSpec]:
     """Return the named lanes, to run sequentially in this order, or all lanes if no lane is named."""
-    lanes = {lane.name: replace(lane, meanwhile=None) for lane in (*LANES, FULL)}
+    lanes = {lane.name: replace(lane, meanwhile=None) for lane in ALL_LANES}
     return [lanes[name] for name in names] if names else list(LANES)
 
 
@@ -101,7 +105,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.lanes", description="Run the lanes of tests.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="linters, quick, full, ...; by default all")
     names = parser.parse_args().names
-    known = [lane.name for lane in (*LANES, FULL)]
+    known = [lane.name for lane in ALL_LANES]
     if unknown := [name for name in names if name not in known]:
         parser.error(f"there is no lane {unknown[0]!r}: name some of {', '.join(known)}")
     return run_lanes(select_lanes(names), write=write)
