@@ -175,6 +175,16 @@ def test_a_control_that_was_not_sent_is_noticed() -> None:
         sent.check(1.5, 0.5, 0.0, "here:1")
 
 
+def test_a_new_car_may_not_have_its_first_control_yet() -> None:
+    """A server that answers late reports that a new car has no control, but only for half a second of its time."""
+    sent = SentControls()
+    for number in range(10):
+        sent.note(7.0 + 0.1 * number, 0.5, 0.0)
+    sent.check(7.4, 0.0, 0.0, "here:1")
+    with pytest.raises(VehicleError, match=r"does not do what it is told \(throttle 0\.00, brake 0\.00\)"):
+        sent.check(7.6, 0.0, 0.0, "here:1")
+
+
 def test_a_guard_whose_server_is_silent_goes_on_without_answering() -> None:
     """A beat is answered only if the server has answered within a second; its silence does not end the guard."""
     clock, asked, is_silent = ManualClock(), 0, True

@@ -16,7 +16,8 @@ MAX_SPEED_MPS: Final = 100.0
 """No car of CARLA is faster."""
 MAX_WHEEL_RAD: Final = math.pi / 2
 HEEDED_S: Final = 0.5
-"""In an asynchronous world, the control in force is one that was sent in so much of the world's time, or the guard's.
+"""In an asynchronous world, the control in force is one that was sent in so much of the world's time, or the guard's. A
+new car has had no control until then.
 """
 MAX_CONTROL_DIFFERENCE: Final = 1e-3
 GUARD_CONTROL: Final = (0.0, 1.0)
@@ -53,11 +54,15 @@ class SentControls:
         self._lock = threading.Lock()
         self._sent: deque[tuple[float, float, float]] = deque()
         """The world's time at the sending, throttle and brake."""
+        self._first_s: float | None = None
+        """The world's time when the first control was sent."""
 
     def note(self, elapsed_s: float, throttle: float, brake: float) -> None:
         """Note a control that is sent at a time of the world."""
         with self._lock:
             self._sent.append((elapsed_s, throttle, brake))
+            if self._first_s is None:
+                self._first_s = elapsed_s
 
     def check(self, elapsed_s: float, throttle: float, brake: float, address: str) -> None:
         """Raise `VehicleError` if the control in force is none of the last ones: the connection may have failed."""
@@ -65,8 +70,11 @@ class SentControls:
             while self._sent and not 0.0 <= elapsed_s - self._sent[0][0] <= HEEDED_S:
                 self._sent.popleft()
             known = [(sent_throttle, sent_brake) for _, sent_throttle, sent_brake in self._sent]
-        if known and all(
-            max(abs(throttle - t), abs(brake - b)) > MAX_CONTROL_DIFFERENCE for t, b in (GUARD_CONTROL, *known)
+            is_new = self._first_s is None or elapsed_s - self._first_s <= HEEDED_S
+        if (
+            known
+            and not is_new
+            and all(max(abs(throttle - t), abs(brake - b)) > MAX_CONTROL_DIFFERENCE for t, b in (GUARD_CONTROL, *known))
         ):
             raise VehicleError(
                 f"the CARLA server at {address} does not do what it is told (throttle {throttle:.2f}, brake "
