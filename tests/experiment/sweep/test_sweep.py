@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import multiprocessing
@@ -120,6 +121,20 @@ def test_the_config_of_a_run_reproduces_it(sweep_folder: Path, tmp_path: Path) -
     directory = sweep_folder / "runs" / two_runs()[0].name
     again = run_once(plan_run(load_config(RunConfig, directory / "config.yaml")), tmp_path / "again")
     assert again["digest"] == json.loads((directory / "result.json").read_text())["digest"]
+
+
+def write_half(path: Path, text: str, **_options: Any) -> int:
+    path.write_bytes(text.encode()[: len(text) // 2])
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_leaves_the_recorded_config(sweep_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sweep that is resumed on a full disk keeps the config from which it can be resumed later."""
+    files = {path.name: path.read_bytes() for path in sweep_folder.iterdir() if path.is_file()}
+    monkeypatch.setattr(Path, "write_text", write_half)
+    with pytest.raises(OSError, match="No space left"):
+        drive_sweep(sweep_config(), two_runs(), sweep_folder, jobs=1, on_progress=lambda _: None)
+    assert {path.name: path.read_bytes() for path in sweep_folder.iterdir() if path.is_file()} == files
 
 
 def test_resuming_with_another_config_is_rejected(sweep_folder: Path) -> None:
@@ -334,7 +349,7 @@ def geometry_sweep(*changes: str) -> tuple[SweepConfig, list[PlannedRun]]:
 def test_digests_are_the_same_on_any_workers(tmp_path: Path) -> None:
     """Runs have the same digests when repeated, with one process, with two, and with Dask workers."""
     pytest.importorskip("distributed")
-    _, planned = geometry_sweep()
+    _, planned = geometry_sweep("repetitions=1")
     workers = {"one": (1, None), "two": (2, None), "again": (2, None), "dask": (2, "local")}
     digests = {}
     for name, (jobs, cluster_address) in workers.items():

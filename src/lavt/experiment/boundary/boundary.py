@@ -214,15 +214,18 @@ class _SearchProgress:
         broken: set[str] = set()
 
         def take(future: Future[dict[str, Any]]) -> None:
-            search = futures.pop(future)
-            try:
+            search, error = futures[future], future.exception()
+            if error is None:
                 self.found[search.name] = future.result()
-            except BrokenExecutor:
+            del futures[future]  # only now: a Ctrl-C before this line must not lose the result
+            if error is None:
+                self._on_progress(f"{search.name}: {_format_boundaries(self.found[search.name])}")
+            elif isinstance(error, BrokenExecutor):
                 broken.add(search.name)
-            except Exception as error:  # an error of one search does not end the others
+            elif isinstance(error, Exception):  # an error of one search does not end the others
                 self.fail(search, describe_error(error))
             else:
-                self._on_progress(f"{search.name}: {_format_boundaries(self.found[search.name])}")
+                raise error
 
         try:
             for future in as_completed(list(futures)):

@@ -24,7 +24,7 @@ from lavt.experiment.sweep.sweep import (
     run_all,
 )
 from lavt.experiment.sweep.workers import is_finished
-from lavt.recording.output_directory import prepare_directory
+from lavt.recording.output_directory import prepare_directory, replace_text
 
 STUDY = "study.yaml"
 """The file with the complete config of a study, in the study's directory."""
@@ -64,7 +64,7 @@ def _check_run(run: PlannedRun, directory: Path) -> None:
 def begin_study(config: StudyConfig, out: Path) -> None:
     """Write the config of a study into its directory; call `open_study` first."""
     (out / "runs").mkdir(exist_ok=True)
-    (out / STUDY).write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+    replace_text(out / STUDY, yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
 
 
 def drive_study(blocks: Sequence[Block], out: Path, *, jobs: int | None, on_progress: ProgressCallback) -> SweepResult:

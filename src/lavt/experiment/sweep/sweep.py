@@ -35,7 +35,7 @@ from lavt.experiment.sweep.workers import (
     is_finished,
     remove_unfinished,
 )
-from lavt.recording.output_directory import prepare_directory
+from lavt.recording.output_directory import prepare_directory, replace_text
 
 SWEEP = "sweep.yaml"
 """The file with the complete config of a sweep, in the sweep's directory."""
@@ -180,7 +180,7 @@ def drive_sweep(
     runs_dir.mkdir(exist_ok=True)
     for run in planned:
         check_run_config(run, runs_dir / run.name)
-    (out / SWEEP).write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+    replace_text(out / SWEEP, yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
     remove_all_unfinished(planned, runs_dir)
     sweep_result, speed = run_all(
         planned, runs_dir, jobs=jobs, on_progress=on_progress, cluster_address=cluster_address, server=server
