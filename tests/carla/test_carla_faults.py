@@ -175,6 +175,8 @@ def test_the_leftovers_of_a_killed_run_are_removed(server: StandIn) -> None:
         assert int(frame) < opened.snapshot.frame
         assert server.ask("actors") == CAR_AND_SENSORS
         assert server.ask("speed").split()[0] == "0.000"
+        state = opened._world.get_snapshot()
+        assert all(state.has_actor(actor.id) for actor in opened._actors), "some might not be destroyed"
     assert server.ask("actors") == ""
     assert server.ask("settings") == "False [False]"
 

@@ -312,7 +312,9 @@ class CarlaSession:
             if self.settings.camera is not None:
                 blueprint = self._camera_blueprint(self.settings.camera)
                 self._attach(blueprint, camera_mount(self.settings.camera, self._axles.rear_axle_m), self.pictures.put)
-        if self.settings.camera is not None:
+        if self.settings.camera is None:
+            self.tick(BRAKED, hand_brake=True)  # the library may refuse to destroy a sensor that no state contains
+        else:
             self._await_picture()
 
     def _camera_blueprint(self, model: CameraModel) -> Any:
