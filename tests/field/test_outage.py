@@ -20,7 +20,7 @@ from tests.field.outage_effects import OutageEffects, effects_table, measure
 from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
 
 from lavt.clock import pause
-from lavt.domain import NS_PER_S
+from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.runs.processes import LAVT
 from lavt.recording.record import read_record
 
@@ -50,6 +50,8 @@ MAX_UNOBSERVED = 0.05
 """The largest allowed share of accepted commands that the observer missed."""
 BRAKE_DELAY_S = 0.5
 """Time for the brake pressure to build up."""
+STATUS_NS = 600 * NS_PER_MS
+"""Then the server's status, up to 0.2 s old, says whether even the shortest outage has stopped the vehicle."""
 CONTINUES_WITHIN_S = 0.5
 """Limit from the end of an outage without a stop until the vehicle is driven again."""
 RECOVERY_S = 10.0
@@ -101,7 +103,7 @@ def cause_network_outages(drive: Drive, names: Sequence[str]) -> None:
         directions, duration_s = name.removesuffix(", again").removesuffix(" s").rsplit(" ", 1)
         drive.reach_speed(SPEED_MPS)
         drive.block_network(name, DIRECTIONS[directions], float(duration_s))
-        pause(NS_PER_S)  # the server's status is up to 0.2 s old
+        pause(STATUS_NS)
 
 
 def measure_and_print(drive: Drive, work: Path, print_report: PrintReport, title: str) -> OutageDriveResult:
@@ -138,7 +140,7 @@ def separate_routers(
     with running_loop(field, work, SEPARATE) as drive:
         drive.reach_speed(SPEED_MPS)
         drive.block_network(SEPARATE_NETWORK_OUTAGE, DIRECTIONS["both ways"], 3.0)
-        pause(NS_PER_S)
+        pause(STATUS_NS)
         for name, role in zip(ROUTERS_KILLED, ("vehicle-router", "operator-router"), strict=True):
             drive.reach_speed(SPEED_MPS)
             drive.kill_and_restart(name, role, RESTART_AFTER_S)

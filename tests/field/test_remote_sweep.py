@@ -23,7 +23,7 @@ RUNS_LIMIT_S = 240.0
 OUTAGE_S = 18.0
 """Longer than a request is repeated, shorter than the lease of the run."""
 SWEEP = {
-    "vehicle": {"scenery": "none", "time_limit_s": 3.0},
+    "vehicle": {"scenery": "none", "time_limit_s": 2.0},
     "record": {"video": False},
     "time": "real",
     "routes": ["straight"],

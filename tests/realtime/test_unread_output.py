@@ -21,7 +21,7 @@ from lavt.experiment.runs.side_configs import client_config, embedded_router, se
 from lavt.recording.record import read_record
 
 DRIVING_WITHIN_S = 150.0
-UNREAD_S = 5
+UNREAD_S = 3
 """A pipe of one page is full after two seconds of status lines."""
 END_LIMIT_S = 15.0
 PIPE_BYTES = 4096
