@@ -51,7 +51,7 @@ MAX_UNOBSERVED = 0.05
 BRAKE_DELAY_S = 0.5
 """Time for the brake pressure to build up."""
 STATUS_NS = 600 * NS_PER_MS
-"""Then the server's status, up to 0.2 s old, says whether even the shortest outage has stopped the vehicle."""
+"""Pause after an outage: the server's status is up to 0.2 s old, and must show whether the vehicle has stopped."""
 CONTINUES_WITHIN_S = 0.5
 """Limit from the end of an outage without a stop until the vehicle is driven again."""
 RECOVERY_S = 10.0

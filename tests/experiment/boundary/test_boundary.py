@@ -7,6 +7,7 @@ import math
 import os
 import signal
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -401,6 +402,23 @@ def test_a_failed_search_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatc
     assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in lines
 
 
+def submit_cancelled(*_: object) -> Future[Any]:
+    future: Future[Any] = Future()
+    future.cancel()
+    future.set_running_or_notify_cancel()
+    return future
+
+
+def test_a_cancelled_search_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that was cancelled, as by a cluster that ends, is listed as failed and raises nothing."""
+    monkeypatch.setattr("lavt.experiment.sweep.workers.process_workers", in_this_process)
+    monkeypatch.setattr(_InThisProcess, "submit", submit_cancelled)
+    results, failed, completed = run_searches(
+        plan_boundary(small_search("repetitions=2")), jobs=1, on_progress=lambda _: None
+    )
+    assert (results, len(failed), completed) == ([], 2, True)
+
+
 DEATHS = {0: 0, 1: 3, 2: 2}
 """The number of processes that die in the search of each repetition."""
 
@@ -470,8 +488,6 @@ class _InThisProcess:
             future.cancel()
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        from concurrent.futures import Future
-
         future: Future[Any] = Future()
         self.futures.append(future)
         if len(self.futures) <= self.max_calls:

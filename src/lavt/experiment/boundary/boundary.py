@@ -214,18 +214,18 @@ class _SearchProgress:
         broken: set[str] = set()
 
         def take(future: Future[dict[str, Any]]) -> None:
-            search, error = futures[future], future.exception()
-            if error is None:
+            search, error = futures[future], None
+            try:
                 self.found[search.name] = future.result()
+            except Exception as raised:  # an error of one search does not end the others
+                error = raised
             del futures[future]  # only now: a Ctrl-C before this line must not lose the result
             if error is None:
                 self._on_progress(f"{search.name}: {_format_boundaries(self.found[search.name])}")
             elif isinstance(error, BrokenExecutor):
                 broken.add(search.name)
-            elif isinstance(error, Exception):  # an error of one search does not end the others
-                self.fail(search, describe_error(error))
             else:
-                raise error
+                self.fail(search, describe_error(error))
 
         try:
             for future in as_completed(list(futures)):

@@ -17,7 +17,7 @@ MAX_SPEED_MPS: Final = 100.0
 MAX_WHEEL_RAD: Final = math.pi / 2
 HEEDED_S: Final = 0.5
 """In an asynchronous world, the control in force is one that was sent in so much of the world's time, or the guard's. A
-new car has had no control until then.
+new car may have another one for so long.
 """
 MAX_CONTROL_DIFFERENCE: Final = 1e-3
 GUARD_CONTROL: Final = (0.0, 1.0)
@@ -54,15 +54,14 @@ class SentControls:
         self._lock = threading.Lock()
         self._sent: deque[tuple[float, float, float]] = deque()
         """The world's time at the sending, throttle and brake."""
-        self._first_s: float | None = None
+        self._first_s = math.inf
         """The world's time when the first control was sent."""
 
     def note(self, elapsed_s: float, throttle: float, brake: float) -> None:
         """Note a control that is sent at a time of the world."""
         with self._lock:
             self._sent.append((elapsed_s, throttle, brake))
-            if self._first_s is None:
-                self._first_s = elapsed_s
+            self._first_s = min(self._first_s, elapsed_s)
 
     def check(self, elapsed_s: float, throttle: float, brake: float, address: str) -> None:
         """Raise `VehicleError` if the control in force is none of the last ones: the connection may have failed."""
@@ -70,7 +69,7 @@ class SentControls:
             while self._sent and not 0.0 <= elapsed_s - self._sent[0][0] <= HEEDED_S:
                 self._sent.popleft()
             known = [(sent_throttle, sent_brake) for _, sent_throttle, sent_brake in self._sent]
-            is_new = self._first_s is None or elapsed_s - self._first_s <= HEEDED_S
+            is_new = elapsed_s - self._first_s <= HEEDED_S
         if (
             known
             and not is_new
