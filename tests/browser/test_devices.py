@@ -14,13 +14,13 @@ RB, RT, B = 5, 7, 1
 
 
 def plug(tab: Tab, device: dict[str, Any] | None) -> None:
-    """Connect a device, change its values, or unplug it."""
-    if device is None:
-        tab.evaluate("navigator.getGamepads = () => [null, null]; 0")
-        return
-    buttons = [{"value": value, "pressed": value > 0.5} for value in device["buttons"]]
-    fake = json.dumps({**device, "buttons": buttons, "connected": True, "index": 0})
+    """Connect a device, change its values, or unplug it, and let the page read it before anything else changes."""
+    fake = "null"
+    if device is not None:
+        buttons = [{"value": value, "pressed": value > 0.5} for value in device["buttons"]]
+        fake = json.dumps({**device, "buttons": buttons, "connected": True, "index": 0})
     tab.evaluate(f"navigator.getGamepads = () => [null, {fake}]; 0")
+    let_time_pass(tab, 100)
 
 
 def moved(device: dict[str, Any], *, axes: dict[int, float] | None = None, buttons: tuple[int, ...] = ()) -> Any:
@@ -62,7 +62,6 @@ def test_a_gamepad_drives_until_it_is_unplugged(person_drive: PersonDrive) -> No
     let_time_pass(tab, 300)
     assert (field(tab, "hand"), field(tab, "safety")) == ("open", "safe_stop")
     plug(tab, GAMEPAD)
-    let_time_pass(tab, 100)
     arm(tab, moved(GAMEPAD, buttons=(RB,)))
 
 
@@ -91,7 +90,6 @@ def test_a_wheel_drives_after_its_calibration(person_drive: PersonDrive) -> None
         plug(tab, moved(rest, **answer))  # type: ignore[arg-type]
         wait_until("the next question", lambda asked=question: hint(tab) != asked)  # type: ignore[misc]
         plug(tab, rest)
-        let_time_pass(tab, 100)
     wait_until("the calibration is saved", lambda: tab.evaluate("localStorage.length") == 1)
     plug(tab, moved(rest, axes={0: -1.0, 1: 0.0}, buttons=(0,)))
     wait_until("it steers to the left", lambda: tab.evaluate("document.querySelector('#steering').value") == -1)
