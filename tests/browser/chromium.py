@@ -81,6 +81,14 @@ class Tab:
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
+    def has_loaded(self, url: str) -> bool:
+        """Return whether the tab has loaded an address; before, a call can end with an error when the page changes."""
+        try:
+            at, state = self.evaluate("[location.href, document.readyState]")
+        except ProtocolError:
+            return False
+        return (at.rstrip("/"), state) == (url.rstrip("/"), "complete")
+
     def key(self, code: str, *, down: bool) -> None:
         """Press or release a key."""
         event = {"code": code, "windowsVirtualKeyCode": KEY_CODES.get(code, ord(code[-1]))}
@@ -116,10 +124,11 @@ class Browser:
         self._port = int(port_file.read_text().splitlines()[0])
 
     def open(self, url: str) -> Tab:
-        """Open an address in a new tab, in front of the others."""
+        """Open an address in a new tab, in front of the others, and wait until it is loaded."""
         tab = Tab(json.loads(self._request("PUT", f"/json/new?{quote(url, safe='')}")))
         self._tabs.append(tab)
         tab.to_front()
+        wait_until(f"{url} is loaded", lambda: tab.has_loaded(url))
         return tab
 
     def close_tab(self, tab: Tab) -> None:

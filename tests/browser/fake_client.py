@@ -10,7 +10,14 @@ from lavt.clock import MachineClock
 from lavt.domain import NS_PER_US, Now
 from lavt.node import Send
 from lavt.transport.console.console_link import ConsoleLink
-from lavt.transport.console.page_messages import PageInput, PageStatus, PageStop, pack_text, parse_page_message
+from lavt.transport.console.page_messages import (
+    PageDelay,
+    PageInput,
+    PageStatus,
+    PageStop,
+    pack_text,
+    parse_page_message,
+)
 
 TOKEN: Final = "0123456789abcdef"
 STATUS: Final[dict[str, Any]] = {
@@ -54,6 +61,7 @@ class FakeClient:
         """Values of the status that differ from `STATUS`."""
         self.inputs: list[PageInput] = []
         self.stops = 0
+        self._marks = 0
         self._link.start(self._deliver)
 
     def _deliver(self, channel: str, payload: Any, now: Now, page: Any) -> None:
@@ -61,6 +69,8 @@ class FakeClient:
             message = parse_page_message(payload)
             if isinstance(message, PageInput):
                 self.inputs.append(message)
+            elif isinstance(message, PageDelay):
+                self._marks += 1
             elif isinstance(message, PageStop):
                 self.stops += 1
                 if self.confirms_stops:
@@ -75,6 +85,12 @@ class FakeClient:
     def wait_for_input(self, expectation: str, *, limit_s: float = 5.0, **values: bool) -> None:
         """Wait until the newest input has these values."""
         wait_until(expectation, lambda: all(getattr(self.inputs[-1], name) == values[name] for name in values), limit_s)
+
+    def wait_for_sent(self, tab: Tab) -> None:
+        """Wait until all that the page has sent so far has arrived: a message that is sent now arrives after it."""
+        before = self._marks
+        tab.evaluate("lavtConsole.send({type: 'delay', video_ms: 0, control_ms: 0})")
+        wait_until("what the page has sent has arrived", lambda: self._marks > before)
 
     def close(self) -> None:
         """End the link."""

@@ -73,8 +73,10 @@ def test_no_input_waits_behind_others(page: ConnectedPage) -> None:
     """While the client sends nothing, the page sends no inputs and shows no old state; a stop is sent."""
     page.client.is_silent = True
     page.pass_time(SILENCE_S)
+    page.client.wait_for_sent(page.tab)
     sent = len(page.client.inputs)
     page.pass_time(SILENCE_S)
+    page.client.wait_for_sent(page.tab)
     assert len(page.client.inputs) == sent
     assert "no status from lavt for" in page.text("hint")
     assert page.text("safety") == "no state"
@@ -83,15 +85,16 @@ def test_no_input_waits_behind_others(page: ConnectedPage) -> None:
     wait_until("the stop is sent", lambda: page.client.stops > 0)
     page.client.is_silent = False
     wait_until("inputs are sent again", lambda: len(page.client.inputs) > sent)
-    assert not page.tab.evaluate("document.body.classList.contains('old')")
+    wait_until("the state is shown", lambda: not page.tab.evaluate("document.body.classList.contains('old')"))
 
 
 def test_no_input_is_sent_behind_unsent_bytes(page: ConnectedPage) -> None:
     """While the browser has not taken what the page has sent, the page sends no inputs."""
     page.tab.evaluate("Object.defineProperty(WebSocket.prototype, 'bufferedAmount', {value: 10000}); 0")
-    page.pass_time(0.1)
+    page.client.wait_for_sent(page.tab)
     sent = len(page.client.inputs)
     page.pass_time(0.3)
+    page.client.wait_for_sent(page.tab)
     assert len(page.client.inputs) == sent
 
 
@@ -99,11 +102,13 @@ def test_a_stop_is_repeated_until_it_is_confirmed(page: ConnectedPage) -> None:
     """A stop is sent again twice a second, and its warning stays, until the vehicle is in an emergency stop."""
     page.stop()
     wait_until("the stop is repeated", lambda: page.client.stops >= 2)
-    assert "not confirmed" in page.text("hint")
+    wait_until("the warning is shown", lambda: "not confirmed" in page.text("hint"))
     page.client.changes = CONFIRMED
     wait_until("the confirmation is shown", lambda: "has confirmed" in page.text("hint"))
+    page.client.wait_for_sent(page.tab)
     stops = page.client.stops
     page.pass_time(1.5)
+    page.client.wait_for_sent(page.tab)
     assert page.client.stops == stops
 
 
