@@ -92,6 +92,7 @@ def test_options_of_a_reset_replace_the_draws() -> None:
         ({"route": "nowhere"}, {}, "nowhere"),
         ({"condition": ("L0", "L99")}, {}, "L99"),
         ({"config": "missing.yaml"}, {}, "missing.yaml"),
+        ({"config": 3}, {}, "config is 3: give the path"),
         ({"changes": ("time=real",)}, {}, "virtual time"),
         ({"changes": ("controller.spee_mps=5",)}, {}, "speed_mps"),
         ({"fidelity": "photo"}, {}, "fidelity"),
@@ -101,6 +102,7 @@ def test_options_of_a_reset_replace_the_draws() -> None:
         ({"changes": "vehicle.scenery=none"}, {}, "give a list of texts"),
         ({"changes": (3,)}, {}, "give a list of texts"),
         ({}, {"route": "nowhere"}, "nowhere"),
+        ({}, 5, "options is 5: give a dictionary"),
     ],
 )
 def test_wrong_settings_are_one_sentence(settings: dict[str, Any], options: dict[str, Any], message: str) -> None:

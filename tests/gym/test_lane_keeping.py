@@ -86,6 +86,7 @@ def test_make_registers_and_describes_the_spaces(make: Make) -> None:
         ({"reward": 3}, "reward is 3"),
         ({"steering_scale_rad": 10**400}, "steering_scale_rad"),
         ({"records": "src"}, "not an empty directory"),
+        ({"records": 3}, "records is 3: give the path"),
     ],
 )
 def test_wrong_settings_are_one_sentence(settings: dict[str, Any], message: str) -> None:

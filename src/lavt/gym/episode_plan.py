@@ -12,7 +12,7 @@ from lavt.config import AGENT, RunConfig
 from lavt.config_file import build_config, find_file, parse_config, read_yaml
 from lavt.errors import UserError
 from lavt.experiment.runs.plan import PlannedRun, plan_run, with_changes
-from lavt.gym.settings import parse_changes, parse_names, parse_range_ms
+from lavt.gym.settings import parse_changes, parse_names, parse_path, parse_range_ms
 
 OPTIONS: Final = {
     "route": "vehicle.route",
@@ -51,7 +51,8 @@ class EpisodePlanner:
         video_ms: Delay,
         control_ms: Delay,
     ) -> None:
-        data = {} if config is None else read_yaml(find_file(Path(config)))
+        path = parse_path("config", config)
+        data = {} if path is None else read_yaml(find_file(path))
         source = "the environment" if config is None else str(config)
         self.base = build_config(
             RunConfig, data, (*parse_changes(changes), f"controller.kind={AGENT}", f"fidelity={fidelity}"), source
@@ -74,6 +75,8 @@ class EpisodePlanner:
 
     def plan(self, generator: np.random.Generator, options: Mapping[str, Any], name: str) -> PlannedRun:
         """Return the plan of the next episode; raise `UserError` for an unknown option or a wrong value."""
+        if not isinstance(options, Mapping):
+            raise UserError(f"options is {options!r}: give a dictionary with keys of {', '.join(OPTIONS)}")
         unknown = [option for option in options if option not in OPTIONS]
         if unknown:
             raise UserError(f"reset has no option {unknown[0]!r}; choose among {', '.join(OPTIONS)}")

@@ -23,7 +23,7 @@ from lavt.experiment.runs.virtual_run import free_finished_loops
 from lavt.gym.agent_drive import AgentDrive
 from lavt.gym.episode_plan import Delay, EpisodePlanner, Names
 from lavt.gym.reward import RewardMeter, parse_weights
-from lavt.gym.settings import check_count, check_positive
+from lavt.gym.settings import check_count, check_positive, parse_path
 from lavt.gym.top_view import draw_top_view
 from lavt.recording.output_directory import check_directory
 
@@ -88,7 +88,7 @@ class LaneKeepingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             video_ms=video_ms,
             control_ms=control_ms,
         )
-        self._records = None if records is None else Path(records)
+        self._records = parse_path("records", records)
         if self._records is not None:
             check_directory(self._records)
         self.render_mode = render_mode
@@ -135,7 +135,9 @@ class LaneKeepingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise ClosedEnvironmentError("the environment is closed: make a new one")
         super().reset(seed=seed)
         self._end_drive()
-        planned = self._planner.plan(self.np_random, options or {}, f"episode-{self._episodes + 1:06d}")
+        planned = self._planner.plan(
+            self.np_random, {} if options is None else options, f"episode-{self._episodes + 1:06d}"
+        )
         self._episodes += 1
         self._drive = drive = AgentDrive(planned, None if self._records is None else self._records / planned.name)
         self._has_ended = False

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from numbers import Integral, Real
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 from lavt.errors import UserError
@@ -30,6 +32,15 @@ def check_count(name: str, value: Any, most: int) -> None:
     """Raise `UserError` unless the value is a whole number from 0 to `most`."""
     if not isinstance(value, Integral) or not is_number(value, 0) or int(value) > most:
         raise UserError(f"{name} is {value!r}: give a whole number from 0 to {most}")
+
+
+def parse_path(name: str, value: Any) -> Path | None:
+    """Return a text or a path as a path; None for None."""
+    if value is None:
+        return None
+    if not isinstance(value, str | PathLike):
+        raise UserError(f"{name} is {value!r}: give the path of a file or directory")
+    return Path(value)
 
 
 def parse_changes(changes: Any) -> tuple[str, ...]:
