@@ -12,7 +12,7 @@ from lavt.config import ClientConfig
 from lavt.config_file import shipped
 from lavt.errors import UserError
 from lavt.transport.zenoh_config import SessionSettings
-from lavt.transport.zenoh_link import configured_endpoints
+from lavt.transport.zenoh_session import configured_endpoints
 
 
 def dialled(session: SessionSettings) -> list[str]:

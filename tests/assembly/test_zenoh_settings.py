@@ -11,7 +11,7 @@ from lavt.config import ClientConfig, ServerConfig
 from lavt.config_file import load_config, parse_config, shipped
 from lavt.errors import UserError
 from lavt.transport.zenoh_config import SessionSettings
-from lavt.transport.zenoh_link import configured_endpoints
+from lavt.transport.zenoh_session import configured_endpoints
 
 EMBEDDED = {"router": "embedded"}
 CLIENT_KEYS = {"key": "operator-1.sign.key", "vehicle": "vehicle-1.sign.pub"}

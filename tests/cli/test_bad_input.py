@@ -23,7 +23,7 @@ from lavt.cli.main import build_app
 from lavt.config_file import shipped
 from lavt.experiment.analysis.results import IDENTITY_KEYS
 from lavt.recording.output_directory import reserve_directory
-from lavt.transport.zenoh_link import Router, quiet_logs
+from lavt.transport.zenoh_session import Router, quiet_logs
 
 DEMO = str(shipped("configs/demo.yaml"))
 BOUNDARY = str(shipped("configs/boundary.yaml"))

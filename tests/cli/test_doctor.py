@@ -36,7 +36,8 @@ from lavt.transport.messages import encode
 from lavt.transport.router_check import Routers
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES, UdpLink
 from lavt.transport.zenoh_config import SessionSettings
-from lavt.transport.zenoh_link import Deliver, Router, ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import Deliver, ZenohLink
+from lavt.transport.zenoh_session import Router, quiet_logs
 
 STATE = State(
     1, 1, 0.0, 0.0, "park", "disarmed", "nobody has armed the vehicle yet", -1, "", active_operator="operator-1"

@@ -16,7 +16,8 @@ from tests.support.ports import free_port
 
 from lavt.config_file import shipped
 from lavt.transport import udp_link
-from lavt.transport.zenoh_link import Router, ZenohLink
+from lavt.transport.zenoh_link import ZenohLink
+from lavt.transport.zenoh_session import Router
 
 LOOPBACK = "127.0.0.1"
 NO_ROUTER = "tcp/127.0.0.1:1"

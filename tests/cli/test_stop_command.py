@@ -16,7 +16,7 @@ from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, NS_PER_S, SessionReply, SessionRequest
 from lavt.node import Send
 from lavt.transport.messages import decode, encode
-from lavt.transport.zenoh_link import Router
+from lavt.transport.zenoh_session import Router
 
 REQUEST = SessionRequest("emergency_stop", "alice", 1, 60)
 ACCEPTED = SessionReply(True, "", 0, b"", 5600, "kernel", 60)

@@ -26,7 +26,8 @@ from lavt.transport.security.envelope import NullVehicleAuthenticator
 from lavt.transport.security.gateway import INFO_NONCE_BYTES, ServerGateway
 from lavt.transport.vehicle_search import FoundVehicle
 from lavt.transport.zenoh_config import SessionSettings
-from lavt.transport.zenoh_link import ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import ZenohLink
+from lavt.transport.zenoh_session import quiet_logs
 
 ROUTER = shipped("zenoh-configs/router-server.json5")
 ESCAPE = "\x1b[2J"

@@ -42,7 +42,7 @@ from lavt.experiment.runs.processes import Processes
 from lavt.recording.record import Record
 from lavt.recording.table import MISSING, IntArray, Table
 from lavt.streams import stream
-from lavt.transport.zenoh_link import quiet_logs
+from lavt.transport.zenoh_session import quiet_logs
 
 pytest.importorskip("cryptography")
 

@@ -14,7 +14,7 @@ from tests.support.ports import free_port
 
 from lavt.errors import WorkError
 from lavt.transport.router_check import MAX_REPORTS, MAX_UNANSWERED, RouterCheck, parse_locators, parse_routers
-from lavt.transport.zenoh_link import _router_reports, quiet_logs
+from lavt.transport.zenoh_session import quiet_logs, router_reports
 
 ANSWERS = (b"\xff", b"[not json", b"[1]", b"7", b"null", b"{}", b'{"zid": 1, "version": 2, "sessions": [3]}', b"")
 """Answers of a peer to a query for a router's report."""
@@ -50,13 +50,13 @@ def session() -> Iterator[zenoh.Session]:
 
 def test_answers_of_strangers_do_no_harm(session: zenoh.Session) -> None:
     """Whatever a peer answers, the check passes, and the endpoints and links are those that the router reports."""
-    check = RouterCheck(partial(_router_reports, session))
+    check = RouterCheck(partial(router_reports, session))
     for _ in range(MAX_UNANSWERED + 1):
         check.run()
     assert not check.has_failed
-    (locator,) = parse_locators(_router_reports(session))
+    (locator,) = parse_locators(router_reports(session))
     assert locator.startswith("tcp/127.0.0.1:")
-    routers = parse_routers(_router_reports(session, "@/*/router"), {str(session.info.zid())})
+    routers = parse_routers(router_reports(session, "@/*/router"), {str(session.info.zid())})
     assert routers is not None
     assert (routers.linked, len(routers.versions)) == (0, 1)
 
@@ -69,7 +69,7 @@ def test_answers_without_end_are_not_all_read(session: zenoh.Session) -> None:
             query.reply(query.key_expr, b"x")
 
     queryable: Any = session.declare_queryable("@/strange/router", answer)
-    assert len(_router_reports(session, "@/strange/router")) == MAX_REPORTS
+    assert len(router_reports(session, "@/strange/router")) == MAX_REPORTS
     queryable.undeclare()
 
 
@@ -92,6 +92,6 @@ def test_a_closed_session_has_failed() -> None:
     session.close()
     closing = threading.Event()
     with pytest.raises(WorkError, match="has failed"):
-        RouterCheck(partial(_router_reports, session)).repeat(closing)
+        RouterCheck(partial(router_reports, session)).repeat(closing)
     closing.set()
-    RouterCheck(partial(_router_reports, session)).repeat(closing)
+    RouterCheck(partial(router_reports, session)).repeat(closing)

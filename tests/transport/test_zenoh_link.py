@@ -24,7 +24,8 @@ from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport import zenoh_link
 from lavt.transport.security.envelope import MAX_ENVELOPE_BYTES, MAX_RUN_REPLY_ENVELOPE_BYTES
 from lavt.transport.zenoh_config import SessionSettings
-from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, REPLY_CHANNELS, Router, ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, REPLY_CHANNELS, ZenohLink
+from lavt.transport.zenoh_session import Router, quiet_logs
 
 ARRIVAL_TIMEOUT_S = 10.0
 CONFIGS = shipped("zenoh-configs")

@@ -52,7 +52,8 @@ from lavt.transport.netem.netem import NetemInterface
 from lavt.transport.rendezvous.link import RendezvousLink
 from lavt.transport.udp_link import UdpLink
 from lavt.transport.video.path_validation import PathServer
-from lavt.transport.zenoh_link import ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import ZenohLink
+from lavt.transport.zenoh_session import quiet_logs
 
 PrintMessage = Callable[[str], None]
 

@@ -14,7 +14,7 @@ from lavt.config import ClientConfig, ServerConfig, ZenohConfig
 from lavt.config_file import build_config, find_file, load_config
 from lavt.errors import UserError
 from lavt.transport.zenoh_config import SessionSettings, flatten, with_host
-from lavt.transport.zenoh_link import configured_endpoints
+from lavt.transport.zenoh_session import configured_endpoints
 
 CONFIG_SUFFIXES: Final = (".yaml", ".yml")
 SESSION_FILE = "zenoh-configs/session.json5"

@@ -33,7 +33,8 @@ from lavt.runtime import process_priority
 from lavt.runtime.resident_memory import lift_lock_limit
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.udp_link import resolve_host
-from lavt.transport.zenoh_link import ZenohLink, configured_endpoints, quiet_logs
+from lavt.transport.zenoh_link import ZenohLink
+from lavt.transport.zenoh_session import configured_endpoints, quiet_logs
 
 PROBE_DURATION_NS = NS_PER_S
 LISTEN_NS = NS_PER_S

@@ -31,7 +31,7 @@ def router(
     """
     console.reserve_stdout()
     process_priority.raise_priority()
-    from lavt.transport.zenoh_link import Router, quiet_logs  # noqa: PLC0415 (slow: Zenoh)
+    from lavt.transport.zenoh_session import Router, quiet_logs  # noqa: PLC0415 (slow: Zenoh)
 
     quiet_logs()
     zenoh_router = Router(find_file(file), parse_overrides(changes or []))

@@ -24,7 +24,8 @@ from lavt.node import Send
 from lavt.recording.output_directory import make_directory
 from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport.messages import encode
-from lavt.transport.zenoh_link import ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import ZenohLink
+from lavt.transport.zenoh_session import quiet_logs
 
 STEP_S = 0.05
 MAX_WAITING = 64

@@ -23,7 +23,8 @@ from lavt.errors import BadMessage, UserError, WorkError
 from lavt.node import Send
 from lavt.transport.messages import decode, encode
 from lavt.transport.security.gateway import Carry
-from lavt.transport.zenoh_link import RouterUnreachable, ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import ZenohLink
+from lavt.transport.zenoh_session import RouterUnreachable, quiet_logs
 
 RETRY_PERIOD_S = 0.1
 """How long to wait for a confirmation before the stop is sent again. A flood of queries makes repetition necessary.

@@ -25,7 +25,7 @@ from lavt.transport.security.gateway import INFO_NONCE_BYTES
 from lavt.transport.security.keys import load_public
 from lavt.transport.vehicle_search import FoundVehicle, FoundVehicles, SearchSession, scout
 from lavt.transport.zenoh_config import SessionSettings
-from lavt.transport.zenoh_link import quiet_logs
+from lavt.transport.zenoh_session import quiet_logs
 
 QUERIES = 5
 """The number of queries to each router; the latency is the median of their round trips."""

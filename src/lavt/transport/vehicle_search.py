@@ -23,7 +23,7 @@ from lavt.errors import BadMessage
 from lavt.transport.messages import NAME, VERSION, decode, decode_versions
 from lavt.transport.security.keys import SIGNATURE_BYTES
 from lavt.transport.zenoh_config import SessionSettings, check_endpoints, check_private_keys, error_text
-from lavt.transport.zenoh_link import RouterUnreachable, load_zenoh_config, open_zenoh
+from lavt.transport.zenoh_session import RouterUnreachable, load_zenoh_config, open_zenoh
 
 KEY: Final = re.compile(rf"lavt/({NAME.pattern.removeprefix('^').removesuffix(chr(92) + 'Z')})/info\Z")
 MAX_ANSWERS: Final = 64

@@ -1,4 +1,4 @@
-"""Commands, states and session requests over Zenoh. Only this module imports `zenoh`.
+"""Commands, states and session requests over Zenoh.
 
 Each side has a router, and the routers are linked to each other. The session of a side is this router itself, or a
 session with a separate router. Safety does not depend on Zenoh: after an outage Zenoh can deliver commands that are
@@ -8,13 +8,11 @@ seconds old, and it reports a lost session only when the lease has expired.
 from __future__ import annotations
 
 import itertools
-import json
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import zenoh
@@ -24,16 +22,9 @@ from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.transport.messages import NAME
-from lavt.transport.router_check import (
-    MAX_REPORTS,
-    REPORT_TIMEOUT_S,
-    RouterCheck,
-    Routers,
-    end_process_later,
-    parse_locators,
-    parse_routers,
-)
+from lavt.transport.router_check import RouterCheck, Routers, end_process_later, parse_locators, parse_routers
 from lavt.transport.zenoh_config import SessionSettings, check_endpoints, check_private_keys, error_text
+from lavt.transport.zenoh_session import RouterUnreachable, load_zenoh_config, open_router, open_zenoh, router_reports
 
 Deliver = Callable[[str, Any, Now, Any], None]
 """Takes (channel, payload, arrived, peer) of each received message."""
@@ -68,11 +59,6 @@ STATE: dict[str, Any] = {**CONTROL, "priority": zenoh.Priority.INTERACTIVE_HIGH}
 """Zenoh's settings for states."""
 
 
-def quiet_logs() -> None:
-    """Restrict Zenoh's log, which goes to standard output, to errors, unless RUST_LOG is set."""
-    zenoh.init_log_from_env_or("error")
-
-
 def check_name(subject: str, name: str) -> str:
     """Return `name` if it can be part of a key; raise `UserError` that names `subject` otherwise."""
     if not NAME.match(name):
@@ -80,103 +66,6 @@ def check_name(subject: str, name: str) -> str:
             f"{subject} {name!r} cannot be part of a Zenoh key: use 1 to 32 letters, digits, _ or -, not _ or - first"
         )
     return name
-
-
-def load_zenoh_config(path: Path, overrides: Mapping[str, Any]) -> zenoh.Config:
-    """Read a config file and set `overrides` (keys with slashes) in it."""
-    if not path.is_file():
-        raise UserError(f"there is no Zenoh config {path}: the shipped ones are in zenoh-configs/")
-    try:
-        config = zenoh.Config.from_file(str(path))
-    except zenoh.ZError as error:
-        raise UserError(f"{path} is not a Zenoh config: {error_text(error)}") from error
-    for key, value in overrides.items():
-        try:
-            config.insert_json5(key, json.dumps(value))
-        except (zenoh.ZError, TypeError, ValueError) as error:
-            raise UserError(
-                f"{key.replace('/', '.')} cannot be {value!r} in a Zenoh config: {error_text(error)}"
-            ) from error
-    return config
-
-
-def _check_listen_endpoints(config: zenoh.Config, path: Path, *, may_be_empty: bool) -> None:
-    """Raise `UserError` if a router's config has no listen endpoints, or an empty list where that is not useful."""
-    endpoints = config.get_json("listen/endpoints")
-    is_default = endpoints == zenoh.Config().get_json("listen/endpoints")
-    configured = json.loads(endpoints)
-    configured = configured.get("router") if isinstance(configured, dict) else configured
-    if is_default or configured is None or not (configured or may_be_empty):
-        raise UserError(f"{path} has no listen endpoints, so Zenoh would listen on all interfaces: add one")
-
-
-def open_zenoh(config: zenoh.Config) -> zenoh.Session:
-    """Open a session; raise `zenoh.ZError` if it cannot be opened, and `UserError` if Zenoh panics at this config."""
-    try:
-        return zenoh.open(config)
-    except Exception:
-        raise
-    except BaseException as error:
-        if type(error).__name__ != "PanicException":  # its class cannot be imported, and is not an `Exception`
-            raise
-        raise UserError(f"Zenoh failed to open a session, so check its config: {error_text(error)}") from error
-
-
-def _open_router(path: Path, changes: Mapping[str, Any], *, must_listen: bool) -> zenoh.Session:
-    """Open a session that is a router; raise `UserError` if the config is wrong or an endpoint cannot be used."""
-    config = load_zenoh_config(path, changes)
-    if json.loads(config.get_json("mode")) != "router":
-        raise UserError(f'{path} is not the config of a router: set mode: "router"')
-    _check_listen_endpoints(config, path, may_be_empty=not must_listen)
-    if not json.loads(config.get_json("adminspace/enabled")):
-        raise UserError(f"set adminspace: {{ enabled: true }} in {path}, or the router cannot report where it listens")
-    check_endpoints(config, "connect.endpoints")
-    check_private_keys(config)
-    try:
-        return open_zenoh(config)
-    except zenoh.ZError as error:
-        raise UserError(f"the router of {path} does not start: {error_text(error)}; use other endpoints") from error
-
-
-def _router_reports(session: zenoh.Session, selector: str = "") -> list[bytes]:
-    """Query the reports of routers, by default that of the router in this process, and return the first answers."""
-    selector = selector or f"@/{session.info.zid()}/router"
-    replies: Any = session.get(selector, timeout=REPORT_TIMEOUT_S, consolidation=zenoh.ConsolidationMode.NONE)
-    return [reply.ok.payload.to_bytes() for reply in itertools.islice(replies, MAX_REPORTS) if reply.ok is not None]
-
-
-def configured_endpoints(path: Path, key: str, changes: Mapping[str, Any]) -> list[str]:
-    """Return the endpoints at `key`, `listen/endpoints` or `connect/endpoints`, of a config file with `changes`."""
-    endpoints = json.loads(load_zenoh_config(path, changes).get_json(key))
-    if isinstance(endpoints, dict):
-        endpoints = endpoints.get("router")
-    return endpoints if isinstance(endpoints, list) else []
-
-
-class Router:
-    """A Zenoh router in this process, from a config file with `mode: "router"`."""
-
-    def __init__(self, path: Path, overrides: Mapping[str, Any]) -> None:
-        self._session = _open_router(path, overrides, must_listen=True)
-        self._check = RouterCheck(partial(_router_reports, self._session))
-
-    def check(self) -> None:
-        """Raise `WorkError` if the router no longer answers."""
-        self._check.run()
-
-    def locators(self) -> list[str]:
-        """Return the endpoints at which the router listens, with the actual port where the config has 0."""
-        return parse_locators(_router_reports(self._session))
-
-    def close(self) -> None:
-        """Stop routing."""
-        if self._check.has_failed:
-            end_process_later()
-        self._session.close()
-
-
-class RouterUnreachable(UserError):
-    """No router answers, or it rejects the session."""
 
 
 def _zenoh_callback(handle: Callable[[str, Any], None], channel: str) -> Callable[[Any], None]:
@@ -236,8 +125,8 @@ class ZenohLink:
         self._check: RouterCheck | None = None
         self._dials = settings.is_router and side == "client"
         if settings.is_router:
-            self._session = _open_router(settings.path, settings.changes, must_listen=False)
-            self._check = RouterCheck(partial(_router_reports, self._session))
+            self._session = open_router(settings.path, settings.changes, must_listen=False)
+            self._check = RouterCheck(partial(router_reports, self._session))
         else:
             self._open_session(settings)
 
@@ -254,7 +143,7 @@ class ZenohLink:
 
     def locators(self) -> list[str]:
         """Return the endpoints at which a session that is a router listens."""
-        return parse_locators(_router_reports(self._session))
+        return parse_locators(router_reports(self._session))
 
     def start(self, deliver: Deliver, *, queries_only: bool = False, answers_runs_only: bool = False) -> None:
         """Start to send and to receive; threads of the link call `deliver`.
@@ -347,7 +236,7 @@ class ZenohLink:
     def routers(self) -> Routers | None:
         """Query the routers for their links and versions; return None if this session's router does not answer."""
         own = {str(zid) for zid in self._session.info.routers_zid()}
-        return parse_routers(_router_reports(self._session, "@/*/router"), own)
+        return parse_routers(router_reports(self._session, "@/*/router"), own)
 
     def close(self) -> None:
         """Close the session; a process with an open session would not end."""

@@ -38,7 +38,7 @@ from lavt.recording.output_directory import prepare_directory
 from lavt.recording.record import read_record
 from lavt.transport.messages import TEXT_BYTES
 from lavt.transport.zenoh_config import with_address
-from lavt.transport.zenoh_link import RouterUnreachable
+from lavt.transport.zenoh_session import RouterUnreachable
 
 ATTEMPTS = 3
 """How often a run is driven at most, if the connection is lost or a part fails."""

@@ -21,7 +21,8 @@ from lavt.domain import NS_PER_MS, NS_PER_S, Now, RunOperation, RunRefusal, RunR
 from lavt.errors import BadMessage, WorkError
 from lavt.node import Send
 from lavt.transport.messages import RECORD_PART_BYTES, decode, encode
-from lavt.transport.zenoh_link import ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import ZenohLink
+from lavt.transport.zenoh_session import quiet_logs
 
 REPEAT_S = 1.0
 """A request without a reply is repeated after this time."""
