@@ -3,7 +3,7 @@ from __future__ import annotations
 import statistics
 import threading
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import pytest
@@ -90,6 +90,15 @@ def test_nodes_are_woken_in_time_and_messages_delivered() -> None:
     assert ("counts", {"node": "driver", "received": 1}) in recorded.entries
 
 
+def wait_until(condition: Callable[[], bool]) -> None:
+    """Wait until a condition is true; whether that is in time is not judged."""
+    clock = MachineClock()
+    end_ns = clock.now().mono_ns + 20 * NS_PER_S
+    while not condition():
+        assert clock.now().mono_ns < end_ns, "the condition is not true within 20 s"
+        pause(NS_PER_MS)
+
+
 class ObservingNode:
     """A node that observes what the node "driver" receives, sends and records, and stores it."""
 
@@ -129,7 +138,9 @@ def test_an_observer_gets_what_others_receive_send_and_record(is_observed: bool)
     runtime.start({"zenoh": recorded})
     for number in range(3):
         runtime.deliver("state", number, runtime.now())
-        pause(NS_PER_S // 20)
+        wait_until(lambda answered=number + 1: len(recorded.sent) == answered)  # type: ignore[misc]
+        wait_until(lambda seen=3 * (number + 1) * is_observed: len(observer.seen) >= seen)  # type: ignore[misc]
+    pause(NS_PER_S // 20)  # for what must not come
     runtime.stop()
     assert runtime.failed is None
     seen = sorted(map(str, observer.seen))
