@@ -187,6 +187,13 @@ class Drive:
 
         wait_until(f"the vehicle is driven at {speed_mps} m/s", is_reached)
 
+    def wait_for_status(self) -> None:
+        """Wait until the server has printed a status that is newer than this call."""
+        server = self.running["server"]
+        for _ in range(2):  # the first one may have been made before
+            before = server.latest
+            wait_until("the server prints a status", lambda before=before: server.latest is not before)  # type: ignore[misc]
+
     def block_network(self, name: str, directions: Sequence[Direction], duration_s: float) -> None:
         """Block the network in these directions for a while; `name` is the outage's name."""
         self.networks.block(directions)

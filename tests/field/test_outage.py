@@ -50,8 +50,8 @@ MAX_UNOBSERVED = 0.05
 """The largest allowed share of accepted commands that the observer missed."""
 BRAKE_DELAY_S = 0.5
 """Time for the brake pressure to build up."""
-STATUS_NS = 600 * NS_PER_MS
-"""Pause after an outage: the server's status is up to 0.2 s old, and must show whether the vehicle has stopped."""
+STOPS_NS = 400 * NS_PER_MS
+"""Pause after an outage, in which the vehicle stops if the outage has delayed commands for too long."""
 CONTINUES_WITHIN_S = 0.5
 """Limit from the end of an outage without a stop until the vehicle is driven again."""
 RECOVERY_S = 10.0
@@ -103,7 +103,8 @@ def cause_network_outages(drive: Drive, names: Sequence[str]) -> None:
         directions, duration_s = name.removesuffix(", again").removesuffix(" s").rsplit(" ", 1)
         drive.reach_speed(SPEED_MPS)
         drive.block_network(name, DIRECTIONS[directions], float(duration_s))
-        pause(STATUS_NS)
+        pause(STOPS_NS)
+        drive.wait_for_status()  # which shows whether it has stopped
 
 
 def measure_and_print(drive: Drive, work: Path, print_report: PrintReport, title: str) -> OutageDriveResult:
@@ -140,7 +141,8 @@ def separate_routers(
     with running_loop(field, work, SEPARATE) as drive:
         drive.reach_speed(SPEED_MPS)
         drive.block_network(SEPARATE_NETWORK_OUTAGE, DIRECTIONS["both ways"], 3.0)
-        pause(STATUS_NS)
+        pause(STOPS_NS)
+        drive.wait_for_status()  # which shows whether it has stopped
         for name, role in zip(ROUTERS_KILLED, ("vehicle-router", "operator-router"), strict=True):
             drive.reach_speed(SPEED_MPS)
             drive.kill_and_restart(name, role, RESTART_AFTER_S)
