@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 
 import pytest
 from tests.browser.chromium import Browser, Tab, wait_until
 from tests.browser.conftest import plug_gamepad, press, release, repeat_keys
 from tests.browser.fake_client import CONFIRMED, FakeClient, wait_until_loaded
+from tests.support.ports import free_port
 
 from lavt.transport.console import console_link
 
@@ -37,7 +39,7 @@ class ConnectedPage:
 
 @pytest.fixture
 def page(browser: Browser) -> Iterator[ConnectedPage]:
-    client = FakeClient()
+    client = FakeClient(free_port(socket.SOCK_STREAM))  # which a later client of the page gets, too
     tab = browser.open(client.url)
     page = ConnectedPage(tab, client)
     try:

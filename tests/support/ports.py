@@ -1,26 +1,41 @@
-"""Free ports of this machine."""
+"""Free ports of this machine, which no socket of another test takes before the test that got them uses them."""
 
 from __future__ import annotations
 
+import itertools
+import os
 import socket
 from contextlib import closing
+from typing import Final
+
+FIRST, LAST = 20_000, 32_767
+"""Below the ports that the system gives to sockets without a port of their own (Linux: from 32768)."""
+STRIDE: Final = 499
+"""Tests that run at the same time, in processes with other numbers, begin this far from each other."""
+_numbers = itertools.count(os.getpid() * STRIDE)
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
     """Return a port that is free at every address: a UDP port, or with `SOCK_STREAM` a TCP port."""
-    with closing(socket.socket(socket.AF_INET, kind)) as trial:
-        trial.bind(("", 0))
-        port: int = trial.getsockname()[1]
-        return port
+    while True:
+        port = FIRST + next(_numbers) % (LAST - FIRST + 1)
+        if _is_free(port, kind):
+            return port
 
 
 def free_port_pair() -> int:
     """Return the first of two consecutive free UDP ports; some tools expect RTP at the first and RTCP at the second."""
     while True:
         port = free_port()
-        with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as second:
-            try:
-                second.bind(("", port + 1))
-            except (OSError, OverflowError):
-                continue
+        if _is_free(port + 1, socket.SOCK_DGRAM):
+            next(_numbers)
             return port
+
+
+def _is_free(port: int, kind: socket.SocketKind) -> bool:
+    with closing(socket.socket(socket.AF_INET, kind)) as trial:
+        try:
+            trial.bind(("", port))
+        except OSError:
+            return False
+    return True
