@@ -262,6 +262,7 @@ def test_a_page_that_sends_single_bytes_is_closed(console: Console, monkeypatch:
 
 def test_a_page_that_is_closed_cannot_go_on_in_new_pages(console: Console) -> None:
     """The openings of pages are limited, whoever makes them; a page that is open stays so."""
+    console.link._opening_limit = RefillingLimit(0, MAX_OPENINGS)  # however long the openings take
     page, number = console.open()
     for _ in range(MAX_OPENINGS - 1):
         console.open()[0].close()
