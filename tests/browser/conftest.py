@@ -69,8 +69,8 @@ class PersonDrive:
 
     def close(self) -> None:
         """Close all pages."""
-        for tab in self._tabs:
-            self._browser.close_tab(tab)
+        while self._tabs:
+            self._browser.close_tab(self._tabs.pop())
 
 
 @pytest.fixture
@@ -157,12 +157,12 @@ def arm(tab: AnyTab) -> None:
     )
 
 
-def drive_off(tab: AnyTab) -> None:
-    """Arm, and accelerate to 2 m/s."""
+def drive_off(tab: AnyTab, *, until: Callable[[], bool] = lambda: True) -> None:
+    """Arm, accelerate to 2 m/s, and drive until a condition is true."""
 
     def accelerates() -> bool:
         if field(tab, "safety") == "driving":
             press(tab, "ArrowUp")
-        return (field(tab, "speed_mps") or 0) > 2
+        return (field(tab, "speed_mps") or 0) > 2 and until()
 
     drive_until(tab, lambda: press(tab, "Space"), lambda: release(tab, "ArrowUp", "Space"), accelerates)

@@ -80,6 +80,7 @@ def test_a_picture_that_never_appeared_has_no_times(person_drive: PersonDrive, s
     since_ns = MachineClock().now().mono_ns
     shown = tab.evaluate("lavtConsole.video.shown")
     wait_until("pictures are drawn", lambda: tab.evaluate("lavtConsole.video.shown") > shown + 40)
+    person_drive.close()  # while pictures come: the last one of the drive appears
     person_drive.process.end()
     pictures = read_record(person_drive.out / "client" / "client.mcap").table("page_picture")
     with stalls.excusing_failures(since_ns):  # the newest picture appears if no other follows for 500 ms

@@ -62,11 +62,8 @@ def test_the_prediction_is_drawn_while_the_car_drives(start: Callable[..., Perso
     drive = start("controller.prediction.shown=true")
     tab = drive.open()
     assert drawn(tab) == 0
-    drive_off(tab)
-    before = drawn(tab)
-    wait_until("predictions are drawn", lambda: drawn(tab) > before + 30)
+    drive_off(tab, until=lambda: drawn(tab) > 30 and are_on_the_road(tab.evaluate(SHAPES)))
     assert tab.evaluate("lavtConsole.video.errors") == 0  # also counts predictions over other pictures
-    wait_until("both shapes are on the road", lambda: are_on_the_road(tab.evaluate(SHAPES)))
     tab.key("Space", down=False)
     wait_until("the car stops", lambda: field(tab, "safety") == "safe_stop")
     wait_until("the shapes are gone", lambda: tab.evaluate(SHAPES)["stop"][0] == 0)
