@@ -13,6 +13,7 @@ import contextlib
 import math
 import os
 import queue
+import signal
 import socket
 import struct
 import sys
@@ -197,6 +198,9 @@ class StandInServer:
             print(f"stand-in: no method {method} {arguments!r}", file=sys.stderr, flush=True)
             return wire.failure(f"the stand-in has no method {method}")
         with self._lock:
+            if method == self._world.faults.interrupted_method:
+                self._world.faults.interrupted_method = ""
+                os.kill(self._world.faults.interrupted_process, signal.SIGINT)
             try:
                 return self._methods[method](*arguments)
             except Refused as refusal:

@@ -103,6 +103,9 @@ class Faults:
     """So many of the next states cannot be read by the package `carla`."""
     kept_kind: str = ""
     """Actors of this kind cannot be removed."""
+    interrupted_process: int = 0
+    interrupted_method: str = ""
+    """During the next request of this method, the process gets SIGINT."""
 
 
 class StandInWorld:

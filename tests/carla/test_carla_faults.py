@@ -181,6 +181,38 @@ def test_the_leftovers_of_a_killed_run_are_removed(server: StandIn) -> None:
     assert server.ask("settings") == "False [False]"
 
 
+def drive_a_tick(server: StandIn, *, interrupted_start: str = "none", interrupted_drive: str = "none") -> None:
+    """Open a session, make a tick and close the session, with SIGINT during a request of these methods."""
+    server.ask("fault", "interrupted_process", os.getpid())
+    server.ask("fault", "interrupted_method", interrupted_start)
+    session = CarlaSession(blind_settings(server.port)[0])
+    server.ask("fault", "interrupted_method", interrupted_drive)
+    try:
+        session.tick(FULL_THROTTLE)
+        session.close()
+    finally:
+        session.close()  # as at the end of the process
+
+
+@pytest.mark.parametrize(
+    "moment",
+    [
+        {"interrupted_start": "set_episode_settings"},
+        {"interrupted_start": "spawn_actor"},
+        {"interrupted_start": "spawn_actor_with_parent"},
+        {"interrupted_drive": "tick_cue"},
+        {"interrupted_drive": "destroy_actor"},
+    ],
+    ids=lambda moment: "".join(moment.values()),
+)
+def test_ctrl_c_in_any_request_leaves_nothing_in_the_world(server: StandIn, moment: dict[str, str]) -> None:
+    """A Ctrl-C during a request of the start, of a tick or of the end leaves no actor and no frozen world."""
+    with pytest.raises(KeyboardInterrupt):
+        drive_a_tick(server, **moment)
+    assert server.ask("actors") == ""
+    assert server.ask("settings") == "False [False]"
+
+
 def test_a_leftover_that_the_server_keeps_is_named_and_stands_still() -> None:
     """A killed run's car that the server does not remove is braked first; it ends the next run, in a frozen world."""
     with stand_in() as server:

@@ -131,9 +131,9 @@ def open_world(carla: Any, client: Any, settings: CarlaSettings) -> OpenedWorld:
         world = _load_town(client, world, settings)
         before = world.get_settings()
         opened = OpenedWorld(world, _settings_to_restore(carla, before), world.get_weather())
-        world.apply_settings(_own_settings(carla, before, settings))
         may_run = not before.synchronous_mode
         try:
+            world.apply_settings(_own_settings(carla, before, settings))
             world.tick(settings.timeout_s)  # without a tick, a frozen world shows no actors
             _remove_leftovers(carla, world, settings)
             may_run = True

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from lavt.domain import Actuation, CameraModel
 from lavt.errors import UserError, VehicleError
+from lavt.vehicle.carla.actors import SpawnedActors
 from lavt.vehicle.carla.connection import (
     OpenedWorld,
     connect,
@@ -74,8 +75,7 @@ class CarlaSession:
         self.pictures = PictureBox(settings.camera or CameraModel())
         self._carla = load_library()
         self._events: deque[CarlaEvent] = deque()
-        self._actors: list[Any] = []
-        """The spawned actors, in order."""
+        self._actors = SpawnedActors()
         self._opened: OpenedWorld | None = None
         self._is_closed = False
         self.is_car_gone = False
@@ -83,7 +83,7 @@ class CarlaSession:
         self._axles = Axles(GUESSED_REAR_AXLE_M, 1.0)
         self._max_steering_rad = 1.0
         self._steering_curve: tuple[tuple[float, float], ...] = ()
-        self._frame = 0
+        self._frame, self._is_ticking = 0, False
         self._dither = 0.0
         self.steer = 0.0  # of the last control
         self._sent = SentControls()
@@ -127,7 +127,9 @@ class CarlaSession:
             return self.snapshot
         with sentences(self.settings, "complete a tick"):
             self.apply(actuation, hand_brake=hand_brake)
-            before, self._frame = self._frame, self._world.tick(self.settings.tick_timeout_s)
+            before, self._is_ticking = self._frame, True
+            self._frame = self._world.tick(self.settings.tick_timeout_s)
+            self._is_ticking = False
             state = self._world.get_snapshot()
         if before and self._frame != before + 1:
             raise VehicleError(
@@ -217,29 +219,28 @@ class CarlaSession:
 
         The settings come last, because with them the world may run by itself again. If the server does not answer or
         the car stays, the world stays frozen, with the rest of the actors, until the next session removes them;
-        `is_car_gone` then is false.
+        `is_car_gone` then is false. What a Ctrl-C in this method prevents is done by its next call, at the latest when
+        the process ends.
         """
         if self._is_closed:
             return
-        self._is_closed = True
-        atexit.unregister(self.close)
         with suppress(RuntimeError):
             self._client.set_timeout(CLOSE_TIMEOUT_S)
-            for car in self._actors[:1]:  # before anything else, because a car in an asynchronous world drives on
-                car.apply_control(self._carla.VehicleControl(brake=1.0, hand_brake=True))
-            for actor in reversed(self._actors):
-                if actor.type_id.startswith("sensor."):
-                    actor.stop()
-                    actor.destroy()  # whether it succeeds: another client may have destroyed it
-                elif not actor.destroy() and any(other.id == actor.id for other in self._world.get_actors()):
-                    return
-            self.is_car_gone = True
-            if self._opened is not None and not self._is_ticked_by_another():
-                self._opened.restore(has_own_weather=bool(self.settings.weather))
+            if self._opened is not None:
+                braked = self._carla.VehicleControl(brake=1.0, hand_brake=True)
+                self.is_car_gone = self._actors.destroy(self._opened.world, braked)
+                if self.is_car_gone and not self._is_ticked_by_another():
+                    self._opened.restore(has_own_weather=bool(self.settings.weather))
+        self._is_closed = True
+        atexit.unregister(self.close)
 
     def _is_ticked_by_another(self) -> bool:
-        """Return whether another client has ticked the world since: if it ran by itself, that client's car drove on."""
-        return not self.settings.is_asynchronous and 0 < self._frame < self._world.get_snapshot().frame
+        """Return whether another client has ticked the world since: if it ran by itself, that client's car drove on.
+
+        A Ctrl-C in a tick loses that tick's number.
+        """
+        newest_own = self._frame + self._is_ticking
+        return not self.settings.is_asynchronous and self._frame > 0 and newest_own < self._world.get_snapshot().frame
 
     def _spawn_car(self) -> Any:
         settings = self.settings
@@ -258,13 +259,13 @@ class CarlaSession:
                     f"{town_of(self._world)}: set vehicle.carla.town and vehicle.carla.map_shift_m, or another route"
                 )
             pose = pose._replace(z_m=lane.transform.location.z + SPAWN_HEIGHT_M)
-            car = self._world.try_spawn_actor(self._blueprint(settings.blueprint), to_transform(self._carla, pose))
+            blueprint = self._blueprint(settings.blueprint)
+            car = self._actors.add(self._world.try_spawn_actor, blueprint, to_transform(self._carla, pose))
         if car is None:
             raise UserError(
                 f"the start is occupied in the CARLA server at {settings.address}: remove the other actor, or set "
                 "vehicle.carla.start or another route"
             )
-        self._actors.append(car)
         return car
 
     def _settle(self) -> None:
@@ -343,8 +344,7 @@ class CarlaSession:
         )
 
     def _attach(self, blueprint: Any, pose: CarlaPose, listener: Callable[[Any], None]) -> None:
-        sensor = self._world.spawn_actor(blueprint, to_transform(self._carla, pose), attach_to=self._car)
-        self._actors.append(sensor)
+        sensor = self._actors.add(self._world.spawn_actor, blueprint, to_transform(self._carla, pose), self._car)
         sensor.listen(listener)
 
     def _blueprint(self, name: str) -> Any:
