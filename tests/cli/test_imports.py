@@ -68,7 +68,10 @@ interrupted = sys.argv[1]
 class Finder:
     def find_spec(self, name, path=None, target=None):
         if name == interrupted:
-            signal.raise_signal(signal.SIGINT)
+            try:
+                signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt:
+                raise ValueError("as from the import of pydantic's models")
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # even if the tests ignore it
 sys.meta_path.insert(0, Finder())
@@ -76,6 +79,22 @@ sys.argv = ["lavt", "run", "absent.yaml"]
 runpy.run_module("lavt", run_name="__main__")
 """
 """A program that sends itself SIGINT when `lavt run` imports the module that the first argument names."""
+
+INTERRUPTED_END = """
+import os, runpy, signal, sys, threading, time
+
+def interrupt():
+    while threading.main_thread().is_alive():  # until the interpreter waits for this thread
+        time.sleep(0.001)
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(60)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # even if the tests ignore it
+threading.Thread(target=interrupt).start()
+sys.argv = ["lavt", "--version"]
+runpy.run_module("lavt", run_name="__main__")
+"""
+"""A program that sends itself SIGINT when `lavt --version` has ended and a thread has not."""
 
 
 @pytest.fixture(scope="module")
@@ -111,3 +130,12 @@ def test_ctrl_c_during_the_start_of_a_command(module: str) -> None:
         [sys.executable, "-c", INTERRUPTED_IMPORT, module], capture_output=True, text=True, timeout=300, check=False
     )
     assert (completed.returncode, completed.stdout, completed.stderr) == (130, "", "")
+
+
+def test_ctrl_c_while_a_command_ends() -> None:
+    """Ctrl-C while a command that has done its work waits for its threads ends it at once, without a traceback."""
+    completed = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_END], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert completed.stdout.startswith("lavt ")
+    assert (completed.returncode, completed.stderr) == (130, "")

@@ -8,7 +8,7 @@ memory (`benchmarks/start.py`, medians of five rounds).
 from __future__ import annotations
 
 import sys
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -134,15 +134,16 @@ def global_options(
     """Measure how network latency affects vision-based teleoperation."""
 
 
-def main() -> None:
-    """Run the command line and exit with the command's exit code."""
+def main(on_imported: Callable[[], object] = lambda: None) -> None:
+    """Run the command line and exit with the command's exit code; call `on_imported` before the command begins."""
     end_with_parent()
-    console.run_command(lambda: _run(sys.argv[1:]))
+    console.run_command(lambda: _run(sys.argv[1:], on_imported))
 
 
-def _run(words: Sequence[str]) -> None:
+def _run(words: Sequence[str], on_imported: Callable[[], object]) -> None:
     is_plain = bool(words) and words[0] in COMMANDS
     app = build_app(words[:1] if is_plain else words, has_all=not is_plain)
     if is_plain and words[0] not in ON_ANY_SYSTEM and "--help" not in words:
         require_real_time(f"lavt {words[0]}")
+    on_imported()
     app()
