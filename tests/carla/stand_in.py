@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any
 
 import cv2  # noqa: F401 (its first import changes the environment, which no test may do)
 from tests.require import need
+from tests.support.ports import free_port_pair
 
 from lavt.vehicle.carla.library import SUPPORTED
 
@@ -66,7 +67,7 @@ class StandIn:
 def stand_in(*options: str) -> Iterator[StandIn]:
     """Start a stand-in server on free ports, and end it afterwards."""
     need_carla()
-    port = free_tcp_pair()
+    port = free_port_pair(socket.SOCK_STREAM)
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.carla.stand_in_server", "--port", str(port), *options],
         cwd=REPOSITORY,
@@ -82,15 +83,3 @@ def stand_in(*options: str) -> Iterator[StandIn]:
             yield StandIn(port, process)
         finally:
             process.kill()
-
-
-def free_tcp_pair() -> int:
-    """Return the first of two consecutive free TCP ports."""
-    while True:
-        with closing(socket.create_server(("127.0.0.1", 0))) as first:
-            port: int = first.getsockname()[1]
-            try:
-                socket.create_server(("127.0.0.1", port + 1)).close()
-            except (OSError, OverflowError):
-                continue
-            return port

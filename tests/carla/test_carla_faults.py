@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -15,7 +16,8 @@ from pathlib import Path
 
 import pytest
 from tests.carla.contract_vehicle import blind_settings, server_config
-from tests.carla.stand_in import REPOSITORY, StandIn, free_tcp_pair, need_carla, stand_in
+from tests.carla.stand_in import REPOSITORY, StandIn, need_carla, stand_in
+from tests.support.ports import free_port_pair
 
 from lavt.assembly.vehicles import VehicleSetup, build_carla, carla_settings
 from lavt.config import ServerCameraConfig, ServerConfig
@@ -56,11 +58,18 @@ def server() -> Iterator[StandIn]:
 
 @contextmanager
 def driving(port: int, **changes: object) -> Iterator[CarlaSession]:
-    """Open a session, and drive for a second."""
-    with closing(CarlaSession(blind_settings(port, tick_timeout_s=TIMEOUT_S, timeout_s=20.0, **changes)[0])) as opened:
+    """Open a session, and drive for a second; on a busy machine a tick can take a while."""
+    with closing(CarlaSession(blind_settings(port, tick_timeout_s=20.0, timeout_s=20.0, **changes)[0])) as opened:
         for _ in range(30):
             opened.tick(FULL_THROTTLE)
         yield opened
+
+
+def expect_no_answer(opened: CarlaSession, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten the time-outs of a session whose server cannot answer."""
+    opened.settings = replace(opened.settings, tick_timeout_s=TIMEOUT_S)
+    opened._client.set_timeout(TIMEOUT_S)
+    monkeypatch.setattr(session, "CLOSE_TIMEOUT_S", HOPELESS_S)
 
 
 def run_lavt(port: int, tmp_path: Path, *changes: str) -> tuple[int, str]:
@@ -106,7 +115,7 @@ def test_a_server_of_another_version_is_refused(tmp_path: Path) -> None:
 def test_an_absent_server_is_named() -> None:
     """Without a server, a sentence names the address, without waiting for the time-out."""
     need_carla()
-    port = free_tcp_pair()
+    port = free_port_pair(socket.SOCK_STREAM)
     with pytest.raises(UserError, match=rf"answers at 127\.0\.0\.1:{port}, because no program listens there: start"):
         CarlaSession(blind_settings(port, timeout_s=600.0)[0])
 
@@ -251,11 +260,11 @@ def test_a_sensor_that_another_client_destroyed_does_not_hinder_the_end(server: 
     assert server.ask("settings") == "False [False]"
 
 
-def pictured_config(port: int) -> ServerConfig:
+def pictured_config(port: int, tick_timeout_s: float = 20.0) -> ServerConfig:
     """Return a config with a camera of the size for which the stand-in server is prepared."""
     width_px, height_px = map(int, PICTURE)
     camera = ServerCameraConfig(source="carla", width_px=width_px, height_px=height_px)
-    return server_config(port, tick_timeout_s=TIMEOUT_S, timeout_s=20.0).model_copy(update={"camera": camera})
+    return server_config(port, tick_timeout_s=tick_timeout_s, timeout_s=20.0).model_copy(update={"camera": camera})
 
 
 @pytest.fixture(scope="module")
@@ -278,11 +287,18 @@ def first_picture(port: int) -> Iterator[tuple[VehicleSetup, Vehicle]]:
         yield setup, vehicle
 
 
+def expect_no_picture(setup: VehicleSetup) -> None:
+    """Shorten the time-out of a camera that cannot send a picture."""
+    opened = setup.camera._session  # type: ignore[attr-defined]
+    opened.settings = replace(opened.settings, tick_timeout_s=TIMEOUT_S)
+
+
 def test_a_camera_that_another_client_destroyed_ends_the_run(camera_server: StandIn) -> None:
     """Without its camera the car cannot be driven: the next picture fails with a sentence, not with a wait forever."""
     with first_picture(camera_server.port) as (setup, vehicle):
         assert camera_server.ask("destroy", "sensor.camera.rgb") == "True"
         vehicle.advance(2 * NS_PER_S)
+        expect_no_picture(setup)
         with pytest.raises(VehicleError, match="the camera is gone"):
             setup.camera.capture(2, 2 * NS_PER_S, None)
     assert camera_server.ask("actors") == ""
@@ -347,7 +363,7 @@ def test_a_frozen_server_ends_the_run_and_its_car_stands_still(monkeypatch: pyte
     with stand_in() as server, driving(server.port) as opened:
         frame = int(server.ask("frame"))
         server.freeze()
-        monkeypatch.setattr(session, "CLOSE_TIMEOUT_S", HOPELESS_S)
+        expect_no_answer(opened, monkeypatch)
         with pytest.raises(VehicleError, match="did not complete a tick"):
             opened.tick(FULL_THROTTLE)
         opened.close()
@@ -363,7 +379,7 @@ def test_a_killed_server_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """A killed server gives a sentence, closing the session does not wait for it, and it is absent for the next run."""
     with stand_in() as server, driving(server.port) as opened:
         server.kill()
-        monkeypatch.setattr(session, "CLOSE_TIMEOUT_S", HOPELESS_S)
+        expect_no_answer(opened, monkeypatch)
         with pytest.raises(VehicleError, match="did not complete a tick"):
             opened.tick(FULL_THROTTLE)
         opened.close()
@@ -374,7 +390,7 @@ def test_a_killed_server_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_late_first_picture_is_awaited(camera_server: StandIn, monkeypatch: pytest.MonkeyPatch) -> None:
     """A camera whose first pictures fail is ticked until one comes; without any, a sentence says what to check."""
     monkeypatch.setattr(session, "MAX_TICKS_TO_PICTURE", 6)
-    settings = carla_settings(pictured_config(camera_server.port), load_road("a_key"))
+    settings = carla_settings(pictured_config(camera_server.port, TIMEOUT_S), load_road("a_key"))
     try:
         assert camera_server.ask("fault", "late_pictures", 3) == "set"
         with closing(CarlaSession(settings)) as opened:
@@ -392,6 +408,7 @@ def test_pictures_of_another_size_end_the_run(camera_server: StandIn) -> None:
     with first_picture(camera_server.port) as (setup, vehicle):
         assert camera_server.ask("fault", "missing_rows", 1) == "set"
         vehicle.advance(2 * NS_PER_S)
+        expect_no_picture(setup)
         with pytest.raises(VehicleError, match="sends pictures of 320x239 pixels instead of 320x240"):
             setup.camera.capture(2, 2 * NS_PER_S, None)
         assert setup.camera.counts["pictures_malformed"] > 0  # type: ignore[attr-defined]

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.carla.stand_in import free_tcp_pair
+from tests.support.ports import free_port_pair
 
 from lavt.cli.main import main
 from lavt.config_file import shipped
@@ -90,7 +90,7 @@ def test_a_silent_program_is_named() -> None:
 def test_a_port_without_a_program_and_an_unknown_host_are_named_at_once() -> None:
     """A refused connection and a name that cannot be resolved need no time-out."""
     with pytest.raises(NoServerError, match="no program listens there"):
-        ask_version("127.0.0.1", free_tcp_pair(), 20.0)
+        ask_version("127.0.0.1", free_port_pair(socket.SOCK_STREAM), 20.0)
     for host in ("nowhere.invalid", "a..b", "x" * 300):
         with pytest.raises(NoServerError, match="the host is unknown"):
             ask_version(host, 2000, 20.0)
@@ -101,7 +101,7 @@ def test_a_sweep_without_a_server_says_so_once(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A sweep whose CARLA server is absent ends before its first run, with one sentence and exit code 2."""
-    port, out = free_tcp_pair(), tmp_path / "out"
+    port, out = free_port_pair(socket.SOCK_STREAM), tmp_path / "out"
     monkeypatch.setattr(library, "version", lambda _: library.SUPPORTED)
     changes = ("--set", f"vehicle.carla.port={port}", "--set", "routes=[a_key]", "--set", "conditions=[L0]")
     words = ["sweep", str(shipped("configs/paper_carla.yaml")), *changes, "--out", str(out)]

@@ -23,11 +23,11 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
             return port
 
 
-def free_port_pair() -> int:
-    """Return the first of two consecutive free UDP ports; some tools expect RTP at the first and RTCP at the second."""
+def free_port_pair(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
+    """Return the first of two consecutive free ports, as for RTP and RTCP."""
     while True:
-        port = free_port()
-        if _is_free(port + 1, socket.SOCK_DGRAM):
+        port = free_port(kind)
+        if _is_free(port + 1, kind):
             next(_numbers)
             return port
 
