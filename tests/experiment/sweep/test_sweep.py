@@ -21,10 +21,10 @@ import pytest
 import yaml
 
 import lavt.experiment.sweep
-from lavt.clock import pause
+from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig, SweepConfig
 from lavt.config_file import load_config, shipped
-from lavt.domain import NS_PER_MS
+from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import PlannedRun, plan_run, plan_sweep
@@ -34,7 +34,17 @@ from lavt.experiment.sweep.workers import Workers, drive_or_read, process_worker
 
 CHANGES = ("fidelity=geometry", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
 END_LIMIT_S = 900
-"""How long a sweep may take to end; the full lane runs at the lowest priority beside another lane."""
+"""How long a sweep may take to begin or to end; the full lane runs at the lowest priority beside another lane."""
+
+
+def wait_until(process: subprocess.Popen[Any], condition: Callable[[], bool]) -> None:
+    """Wait until a condition is true, which a process must reach before it ends."""
+    clock = MachineClock()
+    limit_ns = clock.now().mono_ns + END_LIMIT_S * NS_PER_S
+    while not condition():
+        assert process.poll() is None, f"the process ended with {process.poll()}"
+        assert clock.now().mono_ns < limit_ns, f"not within {END_LIMIT_S} s"
+        pause(20 * NS_PER_MS)
 
 
 def sweep_config(*changes: str) -> SweepConfig:
@@ -206,10 +216,7 @@ def test_a_stopped_sweep_keeps_what_is_finished(signal_number: int, options: tup
         text=True,
         start_new_session=True,
     )
-    for _ in range(3000):
-        if list(out.glob("runs/*/result.json")):
-            break
-        pause(20 * NS_PER_MS)
+    wait_until(process, lambda: bool(list(out.glob("runs/*/result.json"))))
     os.killpg(process.pid, signal_number)  # to all processes of the group, as a terminal does
     _, stderr = process.communicate(timeout=END_LIMIT_S)
     assert process.returncode == 1
@@ -257,10 +264,7 @@ def test_a_second_ctrl_c_ends_a_sweep_at_once(tmp_path: Path) -> None:
         text=True,
         start_new_session=True,
     )
-    for _ in range(3000):
-        if len(list(out.glob("runs/*/*"))) > 1:
-            break
-        pause(20 * NS_PER_MS)
+    wait_until(process, lambda: len(list(out.glob("runs/*/*"))) > 1)
     assert process.stderr is not None
     os.killpg(process.pid, signal.SIGINT)
     printed = list(itertools.takewhile(lambda line: "Ctrl-C again" not in line, process.stderr))
@@ -327,10 +331,7 @@ def test_ctrl_c_in_an_import_keeps_the_exit_code(tmp_path: Path) -> None:
         text=True,
         start_new_session=True,
     )
-    for _ in range(3000):
-        if (tmp_path / "importing").exists():
-            break
-        pause(20 * NS_PER_MS)
+    wait_until(process, (tmp_path / "importing").exists)
     os.killpg(process.pid, signal.SIGINT)
     _, stderr = process.communicate(timeout=END_LIMIT_S)
     assert "results are kept" in stderr
@@ -504,10 +505,7 @@ def test_a_killed_sweep_resumes_to_the_same_summary(tmp_path: Path) -> None:
     undisturbed, killed = tmp_path / "whole", tmp_path / "killed"
     subprocess.run([*command, str(undisturbed)], check=True, capture_output=True)
     process = subprocess.Popen([*command, str(killed)], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    for _ in range(600):
-        if list(killed.glob("runs/*/result.json")):
-            break
-        pause(50 * NS_PER_MS)
+    wait_until(process, lambda: bool(list(killed.glob("runs/*/result.json"))))
     process.kill()
     process.wait()
     assert 0 < len(list(killed.glob("runs/*/result.json"))) < 6
