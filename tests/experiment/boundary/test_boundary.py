@@ -471,6 +471,26 @@ def test_ctrl_c_keeps_the_found_boundaries(interrupts: int, monkeypatch: pytest.
     assert (tmp_path / "boundary.png").stat().st_size > 1000
 
 
+def test_ctrl_c_while_the_results_are_written_does_not_lose_them(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A further Ctrl-C, which comes while the found boundaries are summarized, is raised after they are written."""
+    answers: list[Any] = [KeyboardInterrupt(), []]
+
+    def interrupted_once(_: object) -> list[Any]:
+        answer = answers.pop(0)
+        if isinstance(answer, KeyboardInterrupt):
+            raise answer
+        return list(answer)
+
+    entry = run_entry("a_key", 0)
+    monkeypatch.setattr(boundary_module, "run_searches", lambda *_, **__: ([entry], [], True))
+    monkeypatch.setattr(boundary_module, "summarize_groups", interrupted_once)
+    with pytest.raises(KeyboardInterrupt):
+        boundary_module.search_boundary(small_search(), [], tmp_path, jobs=1, on_progress=lambda _: None)
+    assert json.loads((tmp_path / "boundary.json").read_text())["runs"] == [entry]
+
+
 def interrupt(*_: object, **__: object) -> None:
     raise KeyboardInterrupt
 

@@ -14,7 +14,7 @@ import pytest
 from lavt.clock import pause
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError, WorkError
-from lavt.experiment.sweep.worker_processes import WorkerProcesses
+from lavt.experiment.sweep.worker_processes import WorkerProcess, WorkerProcesses
 from lavt.operating_system import CAN_BLOCK_SIGNALS
 
 
@@ -116,6 +116,29 @@ def test_a_second_ctrl_c_breaks_off_the_call(tmp_path: Path) -> None:
     interrupter.join()
     assert isinstance(calls[0].exception(60), BrokenExecutor)
     assert calls[1].cancelled()
+
+
+class WorkerBesideAnEndingCall(WorkerProcess):
+    """A worker; whenever it is closed, the call of another worker ends."""
+
+    def __init__(self, executor: WorkerProcesses) -> None:
+        self._executor = executor
+
+    def close(self) -> None:
+        """Let another worker become idle."""
+        self._executor._idle.append(self._executor._idle[-1])
+
+    def join(self) -> None:
+        """Wait for nothing, because there is no process."""
+
+
+def test_a_call_that_ends_during_the_end_does_not_disturb_it(workers: WorkerProcesses) -> None:
+    """After a wait that Ctrl-C has interrupted, a call may end while the workers are closed: they are all closed."""
+    workers._idle.appendleft(WorkerBesideAnEndingCall(workers))
+    at_start = multiprocessing.active_children()
+    workers.shutdown()
+    workers._idle.popleft()
+    assert not any(process.is_alive() for process in at_start)
 
 
 def test_errors_of_a_call_are_raised(workers: WorkerProcesses) -> None:

@@ -267,6 +267,20 @@ def search_boundary(
     """
     jobs = 1 if any(drives_alone(search.planned.config) for search in searches) else jobs
     found, failed, is_complete = run_searches(searches, jobs=jobs, on_progress=on_progress)
+    try:
+        content = _write_results(config, found, failed, out)
+    except KeyboardInterrupt:  # a further Ctrl-C must not cost the results of hours
+        _write_results(config, found, failed, out)
+        raise
+    if found:
+        save_figure(out, "boundary", boundary_figure(content), "boundaries", "")
+    return content, is_complete
+
+
+def _write_results(
+    config: BoundaryConfig, found: list[dict[str, Any]], failed: list[dict[str, Any]], out: Path
+) -> dict[str, Any]:
+    """Write `boundary.json` and `boundary.csv`, and return the content of `boundary.json`."""
     content = {
         "schema": 1,
         "config": config.model_dump(mode="json"),
@@ -279,6 +293,4 @@ def search_boundary(
         writer = csv.DictWriter(file, CSV_COLUMNS, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(found)
-    if found:
-        save_figure(out, "boundary", boundary_figure(content), "boundaries", "")
-    return content, is_complete
+    return content

@@ -132,9 +132,10 @@ class WorkerProcesses(Executor):
             self._break_off()
             raise
         if wait:
-            for worker in self._idle:
+            idle = tuple(self._idle)  # after an interrupted wait, threads may still add to it
+            for worker in idle:
                 worker.close()
-            for worker in self._idle:
+            for worker in idle:
                 worker.join()
 
     def _break_off(self) -> None:
