@@ -39,3 +39,22 @@ def test_an_entry_of_a_quantile_stream_depends_only_on_seed_name_and_index() -> 
     assert [entries.at(index) for index in reversed(indices)] == expected[::-1]
     assert [QuantileStream(2, "cost", LEVELS, VALUES).at(index) for index in indices] != expected
     assert [QuantileStream(1, "link", LEVELS, VALUES).at(index) for index in indices] != expected
+
+
+def test_a_quantile_stream_that_is_read_at_two_places_in_turns_draws_each_block_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Reading entries near 0 and near 10^6 in turns draws no block again."""
+    drawn: list[int] = []
+    at = IndexedStream.at
+
+    def counted_at(self: IndexedStream, index: int) -> np.random.Generator:
+        drawn.append(index)
+        return at(self, index)
+
+    monkeypatch.setattr(IndexedStream, "at", counted_at)
+    entries = QuantileStream(1, "cost", LEVELS, VALUES)
+    for index in range(1000):
+        entries.at(index)
+        entries.at(10**6 + index)
+    assert len(drawn) == len(set(drawn))

@@ -53,6 +53,8 @@ class IndexedStream:
 
 BLOCK_ENTRIES = 128
 """`QuantileStream` draws this many entries together, because a single draw takes almost as long as a block."""
+KEPT_BLOCKS = 4
+"""It keeps the last blocks, because a stage that is in two pipelines reads its stream at two places in turns."""
 
 
 class QuantileStream:
@@ -67,16 +69,18 @@ class QuantileStream:
 
         self._stream = IndexedStream(seed, name)
         self._levels, self._values = np.array(levels), np.array(values)
-        self._block = -1
-        self._entries: list[int] = []
+        self._blocks: dict[int, list[int]] = {}
 
     def at(self, index: int) -> int:
         """Return entry `index`, rounded to an integer; it does not depend on the entries that were read before."""
         block, position = divmod(index, BLOCK_ENTRIES)
-        if block != self._block:
+        entries = self._blocks.get(block)
+        if entries is None:
             import numpy as np  # noqa: PLC0415 (as above)
 
             levels = self._stream.at(block).random(BLOCK_ENTRIES)
-            self._entries = np.rint(np.interp(levels, self._levels, self._values)).astype(np.int64).tolist()
-            self._block = block
-        return self._entries[position]
+            entries = np.rint(np.interp(levels, self._levels, self._values)).astype(np.int64).tolist()
+            if len(self._blocks) == KEPT_BLOCKS:
+                del self._blocks[next(iter(self._blocks))]
+            self._blocks[block] = entries
+        return entries[position]

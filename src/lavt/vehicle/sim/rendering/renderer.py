@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lavt.domain import CameraModel, FloatArray, Picture, Pose
-from lavt.streams import stream
+from lavt.streams import IndexedStream, stream
 from lavt.vehicle.sim.rendering.ground import TILE_M, Ground
 from lavt.vehicle.sim.rendering.light import Colour, LightName
 from lavt.vehicle.sim.rendering.panorama import Panorama
@@ -134,7 +134,7 @@ class Renderer:
         weather: WeatherName = "clear",
     ) -> None:
         cv2.setNumThreads(1)  # with more threads the division of work, and so the last bit, could vary
-        self._road, self._model, self._seed = road, model, seed
+        self._road, self._model = road, model
         self._level_model = level_model(model)
         self._ground, self._scenery = world(road, scenery, light, weather)
         self._bands = tuple(Band(self._level_model, level) for level in range(len(SCALES_M)))
@@ -152,6 +152,7 @@ class Renderer:
         self._headlights = Headlights(self._level_model) if air.headlights else None
         self._windscreen = Windscreen(model, air.rain_mmph, seed) if air.rain_mmph else None
         self._positive_noise, self._negative_noise = _noise(model)
+        self._noise_places = IndexedStream(seed, "sensor noise")
 
     def prepare(self) -> None:
         """Fill the caches whose first use would delay a frame: coarse ground along the route, textures and sprites."""
@@ -236,12 +237,11 @@ class Renderer:
 
     def _square_of_tiles(self, band: Band, first_tile: tuple[int, int]) -> Picture:
         """Return the texels of a band's square of tiles, from the cache if the square is the last one."""
-        last = self._last_squares[band.level]
-        if last is not None:
-            last_first_tile, texels = last
-            if last_first_tile == first_tile:
-                return texels
-        texels = self._ground.assemble(band.level, first_tile, band.tiles)
+        last_first_tile, texels = self._last_squares[band.level] or (None, None)
+        if texels is not None and last_first_tile == first_tile:
+            return texels
+        # Into the same array, because the kernel would clear the pages of a new one.
+        texels = self._ground.assemble(band.level, first_tile, band.tiles, texels)
         self._last_squares[band.level] = (first_tile, texels)
         return texels
 
@@ -291,7 +291,7 @@ class Renderer:
         return max(float(np.hypot(*(last.project(points_m) - pixels)[:, :2].T).max()), turned_px)
 
     def _add_noise(self, picture: Picture, number: int) -> None:
-        down, right = stream(self._seed, "sensor noise", number).integers(0, _NOISE_MARGIN_PX, 2).tolist()
+        down, right = self._noise_places.at(number).integers(0, _NOISE_MARGIN_PX, 2).tolist()
         part = np.s_[down : down + self._model.height_px, right : right + self._model.width_px]
         if self._headlights is not None:
             deviation = self._headlights.noise_deviation(_NOISE_DEVIATION)[picture]
