@@ -13,7 +13,6 @@ import contextlib
 import math
 import os
 import queue
-import signal
 import socket
 import struct
 import sys
@@ -200,7 +199,7 @@ class StandInServer:
         with self._lock:
             if method == self._world.faults.interrupted_method:
                 self._world.faults.interrupted_method = ""
-                os.kill(self._world.faults.interrupted_process, signal.SIGINT)
+                os.kill(self._world.faults.interrupted_process, self._world.faults.interrupting_signal)
             try:
                 return self._methods[method](*arguments)
             except Refused as refusal:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -105,7 +106,8 @@ class Faults:
     """Actors of this kind cannot be removed."""
     interrupted_process: int = 0
     interrupted_method: str = ""
-    """During the next request of this method, the process gets SIGINT."""
+    interrupting_signal: int = signal.SIGINT
+    """During the next request of this method, the process gets this signal."""
 
 
 class StandInWorld:

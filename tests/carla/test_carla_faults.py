@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -220,6 +221,24 @@ def test_ctrl_c_in_any_request_leaves_nothing_in_the_world(server: StandIn, mome
         drive_a_tick(server, **moment)
     assert server.ask("actors") == ""
     assert server.ask("settings") == "False [False]"
+
+
+def test_sigterm_during_the_start_of_a_server_leaves_nothing_in_the_world() -> None:
+    """If a service manager ends `lavt server` while it spawns the car, no actor and no frozen world remains."""
+    with stand_in() as server:
+        changes = ["vehicle.kind=carla", "camera.source=carla", f"vehicle.carla.port={server.port}"]
+        ports = ["video.port=0", "clock.probe_port=0", "zenoh.router_settings={listen: {endpoints: [tcp/127.0.0.1:0]}}"]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "lavt", "server", *(word for key in [*changes, *ports] for word in ("--set", key))],
+            env={**os.environ, "PYTHONPATH": str(REPOSITORY / "src")},
+            stderr=subprocess.DEVNULL,
+        )
+        server.ask("fault", "interrupted_process", process.pid)
+        server.ask("fault", "interrupting_signal", int(signal.SIGTERM))
+        server.ask("fault", "interrupted_method", "spawn_actor")
+        assert process.wait(60) == 130
+        assert server.ask("actors") == ""
+        assert server.ask("settings") == "False [False]"
 
 
 def test_a_leftover_that_the_server_keeps_is_named_and_stands_still() -> None:

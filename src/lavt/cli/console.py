@@ -141,6 +141,20 @@ def interruptible(in_progress: str = "") -> Iterator[None]:
         raise WorkError("stopped; the finished results are kept") from None
 
 
+@contextmanager
+def closing_on_signals() -> Iterator[None]:
+    """Raise `KeyboardInterrupt` also when SIGTERM or a closed terminal ends a program that starts or ends.
+
+    So what it has opened is closed: an actor in a CARLA server, for example, would outlive the process.
+    """
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with _signal_handlers(interrupt, signal.SIGTERM):
+        yield
+
+
 class StopEvent:
     """An event that a signal handler can set without a deadlock.
 

@@ -55,5 +55,8 @@ def server(
 
         serve_runs(settings, out or Path("out") / "runs", as_json=as_json)
         return
-    with open_server(settings, out, MachineClock(), console.print_message) as (side, ready):
+    with (
+        console.closing_on_signals(),
+        open_server(settings, out, MachineClock(), console.print_message) as (side, ready),
+    ):
         run_side(side, "", once=once, as_json=as_json, ready=ready)
