@@ -21,7 +21,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
-from lavt.transport import zenoh_link
+from lavt.transport import zenoh_link, zenoh_session
 from lavt.transport.security.envelope import MAX_ENVELOPE_BYTES, MAX_RUN_REPLY_ENVELOPE_BYTES
 from lavt.transport.zenoh_config import SessionSettings
 from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, REPLY_CHANNELS, ZenohLink
@@ -291,6 +291,20 @@ def test_query_without_a_server(routers: tuple[str, str]) -> None:
         alone.send(Send("session", b"query"))
         alone.send(Send("control", b"command"))
     assert received.messages.empty()
+
+
+def test_a_session_that_does_not_close_lets_the_process_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If a peer keeps the router so busy that the session does not close in time, the process ends without an error."""
+    ends: list[bool] = []
+
+    class BusySession:
+        def close(self) -> None:
+            raise zenoh.ZError("close operation timed out!")
+
+    monkeypatch.setattr(zenoh_session, "end_process_later", lambda: ends.append(True))
+    busy: Any = BusySession()
+    zenoh_session.close_session(busy)
+    assert ends == [True]
 
 
 def test_send_after_close(routers: tuple[str, str]) -> None:

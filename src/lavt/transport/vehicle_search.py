@@ -23,7 +23,7 @@ from lavt.errors import BadMessage
 from lavt.transport.messages import NAME, VERSION, decode, decode_versions
 from lavt.transport.security.keys import SIGNATURE_BYTES
 from lavt.transport.zenoh_config import SessionSettings, check_endpoints, check_private_keys, error_text
-from lavt.transport.zenoh_session import RouterUnreachable, load_zenoh_config, open_zenoh
+from lavt.transport.zenoh_session import RouterUnreachable, close_session, load_zenoh_config, open_zenoh
 
 KEY: Final = re.compile(rf"lavt/({NAME.pattern.removeprefix('^').removesuffix(chr(92) + 'Z')})/info\Z")
 MAX_ANSWERS: Final = 64
@@ -186,7 +186,7 @@ class SearchSession:
 
     def close(self) -> None:
         """Close the session."""
-        self._session.close()
+        close_session(self._session)
 
 
 def scout(clock: Clock, duration_s: float) -> list[list[str]]:

@@ -24,7 +24,14 @@ from lavt.node import Send
 from lavt.transport.messages import NAME
 from lavt.transport.router_check import RouterCheck, Routers, end_process_later, parse_locators, parse_routers
 from lavt.transport.zenoh_config import SessionSettings, check_endpoints, check_private_keys, error_text
-from lavt.transport.zenoh_session import RouterUnreachable, load_zenoh_config, open_router, open_zenoh, router_reports
+from lavt.transport.zenoh_session import (
+    RouterUnreachable,
+    close_session,
+    load_zenoh_config,
+    open_router,
+    open_zenoh,
+    router_reports,
+)
 
 Deliver = Callable[[str, Any, Now, Any], None]
 """Takes (channel, payload, arrived, peer) of each received message."""
@@ -254,7 +261,7 @@ class ZenohLink:
                 declared.undeclare()
         if self._listener is not None:
             self._listener.join()
-        session.close()
+        close_session(session)
 
     def _listen(self, channel: str, ring: Any) -> None:
         """Deliver received messages until the subscriber is undeclared."""
