@@ -361,10 +361,11 @@ def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:
     assert files(tmp_path) == {}
 
 
-def test_a_sweep_is_not_resumed_twice_at_once(run: Run, tmp_path: Path) -> None:
-    """While a command drives a sweep, another one for the same directory is rejected."""
+@pytest.mark.parametrize("command", [("sweep", SWEEP, "--resume"), ("boundary", BOUNDARY)])
+def test_two_commands_do_not_write_into_one_directory(run: Run, tmp_path: Path, command: tuple[str, ...]) -> None:
+    """While a command drives a sweep or searches boundaries, another one for the same directory is rejected."""
     with reserve_directory(tmp_path):
-        assert "another command" in run("sweep", SWEEP, "--resume", "--out", str(tmp_path)).rejection()
+        assert "another command" in run(*command, "--out", str(tmp_path)).rejection()
     assert files(tmp_path) == {}
 
 

@@ -12,7 +12,7 @@ from lavt.cli.progress import progress
 from lavt.config import BoundaryConfig
 from lavt.config_file import load_config
 from lavt.errors import WorkError
-from lavt.recording.output_directory import disk_errors_named, prepare_directory
+from lavt.recording.output_directory import disk_errors_named, prepare_directory, reserve_directory
 
 
 def register(app: typer.Typer) -> None:
@@ -41,6 +41,7 @@ def boundary(
     out = out or Path("out") / "boundary"
     prepare_directory(out)
     with (
+        reserve_directory(out),
         console.interruptible("searches"),
         disk_errors_named(out),
         progress(f"boundary search, results in {out}", len(searches)) as report_done,

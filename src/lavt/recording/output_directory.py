@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from lavt.errors import UserError
 
@@ -36,6 +37,19 @@ def make_directory(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{out} cannot be created ({error.strerror}): name another directory with --out") from error
+
+
+def check_writable(out: Path) -> None:
+    """Raise `OSError` if no file can be written into the directory; leave none.
+
+    Called before work whose results are written only at its end.
+    """
+    try:
+        with TemporaryFile(dir=out) as file:
+            file.write(b"\0")
+            file.flush()
+    except OSError as error:  # it can name the temporary file
+        raise OSError(error.errno, error.strerror, str(out)) from error
 
 
 @contextmanager

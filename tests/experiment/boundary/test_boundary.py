@@ -471,6 +471,15 @@ def test_ctrl_c_keeps_the_found_boundaries(interrupts: int, monkeypatch: pytest.
     assert (tmp_path / "boundary.png").stat().st_size > 1000
 
 
+def test_a_directory_that_cannot_be_written_is_named_before_the_first_search(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The results are written at the end of the searches, so a wrong directory ends the command before they begin."""
+    monkeypatch.setattr(boundary_module, "run_searches", lambda *_, **__: pytest.fail("the searches began"))
+    with pytest.raises(OSError, match="absent"):
+        boundary_module.search_boundary(small_search(), [], tmp_path / "absent", jobs=1, on_progress=lambda _: None)
+
+
 def test_ctrl_c_while_the_results_are_written_does_not_lose_them(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -30,6 +30,7 @@ from lavt.experiment.runs.monitored_run import MonitoredRun, drive_monitored
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.experiment.statistics.boundary_summary import CRITERIA, summarize_groups
 from lavt.experiment.sweep.workers import Workers, attempt_in_processes, drives_alone
+from lavt.recording.output_directory import check_writable
 
 BOUNDARY = "boundary.json"
 CSV_COLUMNS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
@@ -265,6 +266,7 @@ def search_boundary(
 
     Returns the content of `boundary.json`, and whether all searches were run.
     """
+    check_writable(out)
     jobs = 1 if any(drives_alone(search.planned.config) for search in searches) else jobs
     found, failed, is_complete = run_searches(searches, jobs=jobs, on_progress=on_progress)
     try:
