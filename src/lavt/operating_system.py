@@ -17,6 +17,9 @@ from lavt.errors import UserError
 HANGUP: Final[tuple[signal.Signals, ...]] = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()
 """The signal of a closed terminal, where there is one."""
 
+ALARM: Final[tuple[signal.Signals, ...]] = (signal.SIGALRM,) if hasattr(signal, "SIGALRM") else ()
+"""The signal of the process's timer, where there is one."""
+
 LOOPBACK: Final = "127.0.0.1"
 
 CAN_BLOCK_SIGNALS: Final = hasattr(signal, "pthread_sigmask")

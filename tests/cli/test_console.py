@@ -8,12 +8,15 @@ import re
 import signal
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
 
 import lavt
 from lavt.cli import console
+from lavt.clock import pause
+from lavt.domain import NS_PER_S
 from lavt.errors import WorkError
 
 
@@ -79,6 +82,26 @@ def test_the_first_interrupt_says_what_is_finished(capsys: pytest.CaptureFixture
     with pytest.raises(WorkError, match="stopped"), console.interruptible("runs"):
         work()
     assert capsys.readouterr().err.count("finishing the runs in progress; Ctrl-C again ends at once") == 1
+
+
+def test_ctrl_c_in_a_callback_that_discards_errors_interrupts_long_work() -> None:
+    """Ctrl-C in a callback of a weak reference, whose errors Python discards, is repeated after the callback."""
+
+    class Figure:
+        pass
+
+    def interrupt(_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    def work() -> None:
+        figure = Figure()
+        reference = weakref.ref(figure, interrupt)
+        del figure
+        assert reference() is None
+        pause(10 * NS_PER_S)
+
+    with pytest.raises(WorkError, match="stopped"), console.interruptible():
+        work()
 
 
 def test_an_ignored_ctrl_c_stays_ignored_by_long_work() -> None:

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from lavt.errors import LavtError, UserError, WorkError
-from lavt.operating_system import HANGUP
+from lavt.operating_system import ALARM, HANGUP
 from lavt.recording.output_directory import disk_errors_named
 from lavt.runtime.output import queue_output
 
@@ -49,6 +49,8 @@ OS_REMEDIES = {
     errno.ENOTDIR: "remove the file in the place of a directory, or name another place",
 }
 """What to do about an error of the operating system."""
+REPETITION_S = 0.01
+"""The time after which an interrupt that Python has discarded is repeated."""
 INPUT_ERRORS = (errno.EISDIR, errno.ENOTDIR)
 """The errors of the operating system that are about a name in the input."""
 
@@ -135,7 +137,10 @@ def interruptible(in_progress: str = "") -> Iterator[None]:
     queue_output("stderr")
     is_ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN  # as in the background of a shell script
     try:
-        with _signal_handlers(interrupt, signal.SIGTERM, *(() if is_ignored else (signal.SIGINT,))):
+        with (
+            _signal_handlers(interrupt, signal.SIGTERM, *(() if is_ignored else (signal.SIGINT,))),
+            _lost_interrupts_repeated(interrupt),
+        ):
             yield
     except KeyboardInterrupt:
         raise WorkError("stopped; the finished results are kept") from None
@@ -153,6 +158,32 @@ def closing_on_signals() -> Iterator[None]:
 
     with _signal_handlers(interrupt, signal.SIGTERM):
         yield
+
+
+@contextmanager
+def _lost_interrupts_repeated(interrupt: Callable[..., None]) -> Iterator[None]:
+    """Call `interrupt` again if Python has discarded its error, as it does in the callbacks of weak references.
+
+    A timer does it, because it needs no lock: the interrupted code can own any.
+    """
+    former_hook, former_handlers = sys.unraisablehook, dict[signal.Signals, Any]()
+
+    def repeat_or_report(discarded: Any) -> None:
+        if discarded.exc_type is not KeyboardInterrupt or not ALARM:
+            former_hook(discarded)
+            return
+        for number in ALARM:
+            former_handlers.setdefault(number, signal.signal(number, interrupt))
+        signal.setitimer(signal.ITIMER_REAL, REPETITION_S)
+
+    sys.unraisablehook = repeat_or_report
+    try:
+        yield
+    finally:
+        sys.unraisablehook = former_hook
+        for number, former_handler in former_handlers.items():
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(number, former_handler)
 
 
 class StopEvent:
