@@ -68,16 +68,15 @@ class Ground:
         self._wear = surface_wear(road)
         self._marks = [(colour, width_m, _marks(road, colour, width_m)) for colour, width_m in _mark_styles(road)]
 
-    def assemble(self, level: int, first_tile: tuple[int, int], count: int, out: Picture | None = None) -> Picture:
+    def assemble(self, level: int, first_tile: tuple[int, int], count: int) -> Picture:
         """Return a picture of `count` x `count` tiles, the first of which has the index `first_tile` (x, y).
 
-        The result is written into `out`, the result of an earlier call for the same level and count, if it is given.
         Row 0 has the lowest y and column 0 the lowest x. The middle of texel i is at (i + 0.5) * scale from the corner.
         The picture has an unused fourth channel, because OpenCV warps texels of four bytes in less than half the time
         that texels of three bytes take. On a wet road it has the share of asphalt.
         """
         pixels = round(TILE_M[level] / SCALES_M[level])
-        assembled = np.empty((count * pixels, count * pixels, 4), dtype=np.uint8) if out is None else out
+        assembled = np.empty((count * pixels, count * pixels, 4), dtype=np.uint8)
         for row in range(count):
             for column in range(count):
                 tile = self.tile(level, first_tile[0] + column, first_tile[1] + row)

@@ -237,11 +237,12 @@ class Renderer:
 
     def _square_of_tiles(self, band: Band, first_tile: tuple[int, int]) -> Picture:
         """Return the texels of a band's square of tiles, from the cache if the square is the last one."""
-        last_first_tile, texels = self._last_squares[band.level] or (None, None)
-        if texels is not None and last_first_tile == first_tile:
-            return texels
-        # Into the same array, because the kernel would clear the pages of a new one.
-        texels = self._ground.assemble(band.level, first_tile, band.tiles, texels)
+        last = self._last_squares[band.level]
+        if last is not None:
+            last_first_tile, texels = last
+            if last_first_tile == first_tile:
+                return texels
+        texels = self._ground.assemble(band.level, first_tile, band.tiles)
         self._last_squares[band.level] = (first_tile, texels)
         return texels
 
@@ -352,6 +353,7 @@ def _haze_of_shares(shares: FloatArray, colour: Colour) -> tuple[Picture, Pictur
     return np.rint(255.0 * (1 - share)).astype(np.uint8), np.rint(added).astype(np.uint8)
 
 
+@lru_cache(maxsize=1)
 def _noise(model: CameraModel) -> tuple[Picture, Picture]:
     """Return positive and negative sensor noise, both larger than a picture. Each frame uses a random part of them."""
     noise = np.rint(_standard_normal(model) * _NOISE_DEVIATION)
