@@ -7,8 +7,8 @@ of this machine. The goal is a median of at most 1.15 times that of the floor.
 
     python benchmarks/glass_latency.py [--seconds 30] [--rounds 3] [--fit]
 
-With `--fit`, the page's canvas has the size of the video, so that the browser need not scale it. Prints the median and
-P95 (ms) of each round, and the ratios of the medians.
+Both show the pictures in the same size: that of the page in its window or, with `--fit`, that of the video, so that
+nothing is scaled. Prints the median and P95 (ms) of each round, and the ratios of the medians.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ REPOSITORY = Path(__file__).parents[1]
 GOAL = 1.15
 SCREEN_PX = (1800, 900)
 FLOOR_AT_PX = (1100, 30)
+VIDEO_PX = (640, 480)
 POLL_NS = 500 * NS_PER_US
 SETTLE_NS = NS_PER_S
 MAX_AGE_NS = 2 * NS_PER_S
@@ -97,8 +98,9 @@ def measure(settings: list[str], duration_s: float, *, fits: bool) -> tuple[Any,
             wait_until("the page shows the video", lambda: shown(tab) > 0)
             if fits:
                 tab.evaluate(FIT)
-            with running_floor(url, screen.display):
-                places = {"page": Place(*tab.evaluate(PLACE)), "floor": Place(*FLOOR_AT_PX)}
+            place = Place(*tab.evaluate(PLACE))
+            places = {"page": place, "floor": Place(*FLOOR_AT_PX, place.scale)}
+            with running_floor(url, screen.display, place.scale):
                 wait_until("the floor shows the video", lambda: bool(screen.read_stamp(places["floor"])))
                 pause(SETTLE_NS)
                 seen = watch(screen, places, duration_s)
@@ -120,10 +122,11 @@ def shown(tab: Tab) -> int:
 
 
 @contextmanager
-def running_floor(url: str, display: str) -> Iterator[None]:
-    """Run the minimal client during the `with` block."""
+def running_floor(url: str, display: str, scale: float) -> Iterator[None]:
+    """Run the minimal client during the `with` block; `scale` is the size of the video's pixels on the screen."""
+    size_px = [round(scale * length) for length in VIDEO_PX]
     floor = subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.pages.window_page", url, *map(str, FLOOR_AT_PX)],
+        [sys.executable, "-m", "benchmarks.pages.window_page", url, *map(str, [*FLOOR_AT_PX, *size_px])],
         cwd=REPOSITORY,
         env={**os.environ, "DISPLAY": display, "PYTHONPATH": f"{REPOSITORY / 'src'}{os.pathsep}{REPOSITORY}"},
     )

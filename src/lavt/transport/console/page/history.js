@@ -11,10 +11,15 @@ export class History {
     this.#canvas = canvas;
   }
 
-  // Add a value, or a gap (null), and draw.
-  add(value, now_ms = performance.now()) {
+  // Add a value, or a gap (null).
+  add(value) {
+    const now_ms = performance.now();
     this.#points.push([now_ms, value]);
     while (this.#points[0][0] < now_ms - LENGTH_MS) this.#points.shift();
+  }
+
+  draw() {
+    const now_ms = performance.now();
     const { width, height } = this.#canvas;
     const context = this.#canvas.getContext("2d");
     const top = Math.max(FULL_MS, ...this.#points.map(([, point]) => point ?? 0));

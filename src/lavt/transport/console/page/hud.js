@@ -12,7 +12,9 @@ const STOP_NOT_SENT = "emergency stop NOT sent: no connection to lavt. Use anoth
 const STOP_SENT_LATER = "It is sent if the connection returns";
 const STOP_NOT_CONFIRMED = "emergency stop sent, not confirmed yet";
 const STALE_MS = 1000; // lavt sends a status every 50 ms
+const FIGURES_PERIOD_MS = 200; // nobody reads them faster, and each change delays the video by a layout of the page
 const history = new History(byId("history"));
+let figures_ms = -Infinity; // when the figures were last shown
 const HANDS = {
   not_seen: "release the dead-man control (the space bar), then hold it",
   not_live: "click the page, then release the dead-man control (the space bar) and hold it",
@@ -20,14 +22,20 @@ const HANDS = {
   no_input: "this page sent no input for a moment: release the dead-man control, then hold it",
 };
 
+// Change the text of an element: each change, also to the same text, makes the browser lay out and paint the page again.
+function write(name, text) {
+  const element = byId(name);
+  if (element.textContent !== String(text)) element.textContent = text;
+}
+
 // `stop` is "pending" if an emergency stop waits for a connection, "lost" if there will be none, and else empty.
 export function showClosed(text, stop = "") {
-  byId("connection").textContent = "not connected";
+  write("connection", "not connected");
   showSafety("");
-  byId("reason").textContent = "";
+  write("reason", "");
   byId("stop").className = "";
   const warnings = { "": text, pending: `${STOP_NOT_SENT} ${STOP_SENT_LATER}`, lost: `${STOP_NOT_SENT} ${text}` };
-  byId("hint").textContent = warnings[stop];
+  write("hint", warnings[stop]);
   byId("take").hidden = byId("release").hidden = byId("speed_limit").hidden = true;
   markOld(true);
 }
@@ -41,17 +49,16 @@ function markOld(isOld) {
 export function showSilence(silence_ms, isStopPending) {
   if (silence_ms < STALE_MS) return;
   const silence = `no status from lavt for ${Math.floor(silence_ms / 1000)} s`;
-  byId("connection").textContent = silence;
+  write("connection", silence);
   markOld(true);
   showSafety("");
-  byId("reason").textContent = "";
-  byId("hint").textContent = isStopPending
-    ? `${STOP_NOT_CONFIRMED}, and ${silence}: use another emergency stop`
-    : `${silence}: the page does not know what the vehicle does`;
+  write("reason", "");
+  const [unconfirmed, unknown] = [`${STOP_NOT_CONFIRMED}, and ${silence}: use another emergency stop`, `${silence}: the page does not know what the vehicle does`];
+  write("hint", isStopPending ? unconfirmed : unknown);
 }
 
 function showSafety(name) {
-  byId("safety").textContent = SAFETY[name] ?? "no state";
+  write("safety", SAFETY[name] ?? "no state");
   byId("safety").className = `badge ${name in SAFETY ? name : ""}`;
 }
 
@@ -61,41 +68,46 @@ export function showStatus(status, input, video, age_ms, isStopPending, notice) 
   document.body.classList.toggle("watching", isWatching);
   markOld(false);
   const watched = isWatching ? ` ${status.controller}` : "";
-  byId("connection").textContent = status.role === "drives" ? "this page drives" : `this page watches${watched}`;
+  write("connection", status.role === "drives" ? "this page drives" : `this page watches${watched}`);
   showSafety(status.safety);
   const rejected = status.rejected && `command rejected: ${status.rejected}`;
   const limited = status.limited && `limited: ${status.limited}`;
   const requested = status.requested_by && `${status.requested_by} requests control`;
-  byId("reason").textContent = [status.reason, requested, rejected, limited].filter(Boolean).join(" · ");
-  byId("hint").textContent = hint(status, input, isStopPending, notice);
+  write("reason", [status.reason, requested, rejected, limited].filter(Boolean).join(" · "));
+  write("hint", hint(status, input, isStopPending, notice));
   byId("release").hidden = !(status.role === "drives" && status.has_control && status.requested_by !== "");
-  byId("release").textContent = `Hand over to ${status.requested_by}`;
+  write("release", `Hand over to ${status.requested_by}`);
   byId("take").hidden = !(status.role === "watches" && status.can_drive);
-  const [speed, target] = [byId("speed").querySelector("b"), byId("speed").querySelector("i")];
-  speed.textContent = status.speed_mps === null ? "–" : (status.speed_mps * 3.6).toFixed(0);
-  target.textContent = (status.target_mps * 3.6).toFixed(0);
+  write("speed_kmh", status.speed_mps === null ? "–" : (status.speed_mps * 3.6).toFixed(0));
+  write("target_kmh", (status.target_mps * 3.6).toFixed(0));
   showSpeedLimit(status);
   byId("steering").value = -input.steering; // to the right on the screen is to the right
   byId("throttle").value = input.throttle;
   byId("brake").value = input.brake;
   for (const element of document.querySelectorAll("[data-latency]")) element.hidden = !status.shows_latency;
-  byId("video_ms").textContent = ms(status.video_ms);
-  byId("round_trip_ms").textContent = ms(status.round_trip_ms);
-  byId("shown_ms").textContent = ms(video.shown_ms);
-  byId("age_ms").textContent = ms(age_ms);
-  byId("bit_rate").textContent = `${(status.bit_rate_bps / 1e6).toFixed(1)} Mb/s`;
-  byId("lost_share").textContent = status.lost_share === null ? "–" : `${(status.lost_share * 100).toFixed(1)} %`;
-  byId("errors").textContent = video.errors;
   history.add(age_ms);
+  if (performance.now() - figures_ms >= FIGURES_PERIOD_MS) showFigures(status, video, age_ms);
   byId("stop").className = isPast(status) ? "" : status.emergency_stop;
   showNetwork(status);
+}
+
+function showFigures(status, video, age_ms) {
+  figures_ms = performance.now();
+  write("video_ms", ms(status.video_ms));
+  write("round_trip_ms", ms(status.round_trip_ms));
+  write("shown_ms", ms(video.shown_ms));
+  write("age_ms", ms(age_ms));
+  write("bit_rate", `${(status.bit_rate_bps / 1e6).toFixed(1)} Mb/s`);
+  write("lost_share", status.lost_share === null ? "–" : `${(status.lost_share * 100).toFixed(1)} %`);
+  write("errors", video.errors);
+  history.draw();
 }
 
 // The speed above which the vehicle brakes, rounded down, and why. A vehicle without a speed governor reports none.
 function showSpeedLimit({ speed_limit_mps, speed_limit_reason }) {
   byId("speed_limit").hidden = speed_limit_mps === null;
   const reason = speed_limit_reason && `: ${speed_limit_reason}`;
-  byId("speed_limit").textContent = `at most ${Math.floor(speed_limit_mps * 3.6)} km/h${reason}`;
+  write("speed_limit", `at most ${Math.floor(speed_limit_mps * 3.6)} km/h${reason}`);
 }
 
 // The vehicle has executed an emergency stop of this client, but is in another state now.
@@ -137,8 +149,8 @@ function ms(value) {
 // Show the question of a calibration; without one, whether there is a device to calibrate.
 export function showCalibration(calibration) {
   byId("calibrate").hidden = calibration === null && devices().length === 0;
-  byId("calibrate").textContent = calibration === null ? "Calibrate a wheel or gamepad" : "Cancel";
-  if (calibration !== null) byId("hint").textContent = `${QUESTIONS[calibration.next]} (meanwhile, only Esc and the page's button stop)`;
+  write("calibrate", calibration === null ? "Calibrate a wheel or gamepad" : "Cancel");
+  if (calibration !== null) write("hint", `${QUESTIONS[calibration.next]} (meanwhile, only Esc and the page's button stop)`);
 }
 
 let shownConditions = "";
@@ -163,6 +175,6 @@ function showNetwork(status) {
   ["video", "control"].forEach((flow, index) => {
     const slider = byId(`${flow}_delay`);
     if (document.activeElement !== slider) slider.value = status.delay[index];
-    byId(`${flow}_delay_ms`).textContent = `${status.delay[index].toFixed(0)} ms`;
+    write(`${flow}_delay_ms`, `${status.delay[index].toFixed(0)} ms`);
   });
 }

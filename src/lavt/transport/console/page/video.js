@@ -2,6 +2,7 @@
 
 import { pageTime_us } from "./clock.js";
 import { drawLane } from "./lane.js";
+import { Painter } from "./painter.js";
 import { Predictions, drawPrediction, isOfStamp } from "./prediction.js";
 import { readStamp } from "./stamp.js";
 
@@ -19,8 +20,8 @@ export async function canDecode() {
 }
 
 export class Video {
-  #canvas;
   #context;
+  #painter;
   #decoder = null;
   #pending = new Map(); // by timestamp in the decoder: [RTP timestamp, time of arrival in us]
   #number = 0;
@@ -32,8 +33,8 @@ export class Video {
   // `report(times)` when a picture with a readable stamp is about to appear.
   constructor(canvas, acknowledge, lose, report) {
     this.#report = report;
-    this.#canvas = canvas;
     this.#context = canvas.getContext("2d", { desynchronized: true, alpha: false });
+    this.#painter = new Painter(this.#context);
     this.#acknowledge = acknowledge;
     this.#lose = lose;
     this.lanes = null; // the lanes to draw; null: none are detected
@@ -100,11 +101,7 @@ export class Video {
       this.#pending.delete(frame.timestamp);
       const lane = this.lanes === null ? null : await this.lanes.of(unit);
       if (decoder !== this.#decoder) return; // it was closed while the picture waited
-      if (this.#canvas.width !== frame.displayWidth || this.#canvas.height !== frame.displayHeight) {
-        this.#canvas.width = frame.displayWidth;
-        this.#canvas.height = frame.displayHeight;
-      }
-      this.#context.drawImage(frame, 0, 0);
+      await this.#painter.paint(frame);
       if (this.#context.isContextLost?.()) return this.#fail(); // then nothing has been drawn
       if (lane !== null) drawLane(this.#context, lane);
       const prediction = this.predictions.of(unit);
