@@ -280,6 +280,7 @@ VIDEO = """(async () => {
   const video = new Video(canvas, () => calls.push("acknowledged"), () => calls.push("lost"), () => {});
   video.push({data: new Uint8Array(%s), unit: 1, isKeyframe: true});
   globalThis.VideoDecoder = real;
+  await new Promise((resolve) => setTimeout(resolve)); // a picture is drawn after those before it
   return [calls.join(), video.errors];
 })()"""
 

@@ -12,6 +12,9 @@ class SpawnedActors:
 
     def __init__(self) -> None:
         self._actors: list[Any] = []
+        self.are_new = False
+        """Whether one was spawned after the newest state of the world, so that the library does not know if it is
+        alive, and may refuse to destroy it."""
 
     def __iter__(self) -> Iterator[Any]:
         return (actor for actor in self._actors if actor is not None)
@@ -21,14 +24,15 @@ class SpawnedActors:
 
         A Ctrl-C during the request is handled only after `extend`, so that the actor is never lost.
         """
+        self.are_new = True
         self._actors.extend(starmap(spawn, [arguments]))
         return self._actors[-1]
 
     def destroy(self, world: Any, braked: Any) -> bool:
         """Brake the car by the control `braked`, and destroy all actors; return False if the server keeps the car.
 
-        After a Ctrl-C in this method, another call destroys the rest. Raises `RuntimeError` if the server does not
-        answer.
+        They must not be new. After a Ctrl-C in this method, another call destroys the rest. Raises `RuntimeError` if
+        the server does not answer.
         """
         alive = [actor for actor in self if actor.is_alive]
         for car in alive[:1]:  # before anything else, because a car in an asynchronous world drives on

@@ -124,12 +124,12 @@ class CarlaSession:
         if self.settings.is_asynchronous:
             self.apply(actuation, hand_brake=hand_brake)
             self.snapshot = self.wait_for_state()
+            self._actors.are_new = False
             return self.snapshot
         with sentences(self.settings, "complete a tick"):
             self.apply(actuation, hand_brake=hand_brake)
-            before, self._is_ticking = self._frame, True
-            self._frame = self._world.tick(self.settings.tick_timeout_s)
-            self._is_ticking = False
+            before = self._frame
+            self._advance(self._world, self.settings.tick_timeout_s)
             state = self._world.get_snapshot()
         if before and self._frame != before + 1:
             raise VehicleError(
@@ -227,12 +227,24 @@ class CarlaSession:
         with suppress(RuntimeError):
             self._client.set_timeout(CLOSE_TIMEOUT_S)
             if self._opened is not None:
+                if self._actors.are_new:
+                    self._advance(self._opened.world, CLOSE_TIMEOUT_S)
                 braked = self._carla.VehicleControl(brake=1.0, hand_brake=True)
                 self.is_car_gone = self._actors.destroy(self._opened.world, braked)
                 if self.is_car_gone and not self._is_ticked_by_another():
                     self._opened.restore(has_own_weather=bool(self.settings.weather))
         self._is_closed = True
         atexit.unregister(self.close)
+
+    def _advance(self, world: Any, timeout_s: float) -> None:
+        """Wait for the next state of the world, and in a synchronous one make it by a tick."""
+        if self.settings.is_asynchronous:
+            world.wait_for_tick(timeout_s)
+        else:
+            self._is_ticking = True
+            self._frame = world.tick(timeout_s)
+            self._is_ticking = False
+        self._actors.are_new = False
 
     def _is_ticked_by_another(self) -> bool:
         """Return whether another client has ticked the world since: if it ran by itself, that client's car drove on.
