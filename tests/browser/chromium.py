@@ -17,7 +17,6 @@ from http.client import HTTPConnection
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
-from urllib.parse import quote
 
 from websockets.sync.client import connect
 
@@ -125,9 +124,10 @@ class Browser:
 
     def open(self, url: str) -> Tab:
         """Open an address in a new tab, in front of the others, and wait until it is loaded."""
-        tab = Tab(json.loads(self._request("PUT", f"/json/new?{quote(url, safe='')}")))
+        tab = Tab(json.loads(self._request("PUT", "/json/new?about:blank")))
         self._tabs.append(tab)
         tab.to_front()
+        tab.call("Page.navigate", url=url)  # a new tab with an address stays empty at times
         wait_until(f"{url} is loaded", lambda: tab.has_loaded(url))
         return tab
 
