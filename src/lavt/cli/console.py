@@ -152,11 +152,7 @@ def closing_on_signals() -> Iterator[None]:
 
     So what it has opened is closed: an actor in a CARLA server, for example, would outlive the process.
     """
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    with _signal_handlers(interrupt, signal.SIGTERM):
+    with _signal_handlers(signal.default_int_handler, signal.SIGTERM):
         yield
 
 

@@ -274,7 +274,7 @@ def test_a_page_that_is_closed_cannot_go_on_in_new_pages(console: Console) -> No
 
 
 def test_too_many_connections_wait_unaccepted(console: Console, caplog: pytest.LogCaptureFixture) -> None:
-    """Above the limit, connections wait in the kernel and cost nothing; later ones are served again; nobody is told."""
+    """Above the limit, connections wait in the kernel at no cost; later ones are served again; nothing is logged."""
     console.link._connection_limit = RefillingLimit(CONNECTIONS_PER_S, CONNECTIONS_PER_S)
     page, number = console.open()
     for _ in range(4 * CONNECTIONS_PER_S):

@@ -1,10 +1,14 @@
-"""The actors of a session in a CARLA server: a Ctrl-C at any moment leaves none of them that is not known here."""
+"""The actors of a session in a CARLA server, and their blueprints. A Ctrl-C at any moment leaves no unknown actor."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from itertools import starmap
 from typing import Any
+
+from lavt.domain import CameraModel
+from lavt.errors import UserError
 
 
 class SpawnedActors:
@@ -31,16 +35,40 @@ class SpawnedActors:
     def destroy(self, world: Any, braked: Any) -> bool:
         """Brake the car by the control `braked`, and destroy all actors; return False if the server keeps the car.
 
-        They must not be new. After a Ctrl-C in this method, another call destroys the rest. Raises `RuntimeError` if
+        They should not be new. After a Ctrl-C in this method, another call destroys the rest. Raises `RuntimeError` if
         the server does not answer.
         """
         alive = [actor for actor in self if actor.is_alive]
-        for car in alive[:1]:  # before anything else, because a car in an asynchronous world drives on
+        cars = [actor for actor in alive if not actor.type_id.startswith("sensor.")]
+        for car in cars:  # before anything else, because a car in an asynchronous world drives on
             car.apply_control(braked)
-        for actor in reversed(alive):
-            if not actor.type_id.startswith("sensor."):
-                return actor.destroy() or all(other.id != actor.id for other in world.get_actors())
-            if actor.is_listening():
-                actor.stop()
-            actor.destroy()  # whether it succeeds: another client may have destroyed it
-        return True
+        for sensor in reversed([actor for actor in alive if actor not in cars]):
+            if sensor.is_listening():
+                sensor.stop()
+            sensor.destroy()  # whether it succeeds: another client may have destroyed it
+        return all(car.destroy() or all(other.id != car.id for other in world.get_actors()) for car in cars)
+
+
+def find_blueprint(world: Any, name: str, role_name: str) -> Any:
+    """Return the blueprint of this name, with the role name of the session; raise `UserError` without one."""
+    try:
+        blueprint = world.get_blueprint_library().find(name)
+    except IndexError:
+        raise UserError(f"the CARLA server has no {name!r}: set vehicle.carla.blueprint to another car") from None
+    if blueprint.has_attribute("role_name"):
+        blueprint.set_attribute("role_name", role_name)
+    return blueprint
+
+
+def set_camera(blueprint: Any, model: CameraModel) -> None:
+    """Set the attributes of a camera's blueprint."""
+    attributes = {
+        "image_size_x": model.width_px,
+        "image_size_y": model.height_px,
+        "fov": math.degrees(model.field_of_view_rad),
+        "sensor_tick": 0.0,  # a picture in each tick; other values do not divide exactly
+        "motion_blur_intensity": 0.0,
+    }
+    for name, value in attributes.items():
+        if blueprint.has_attribute(name):
+            blueprint.set_attribute(name, str(value))

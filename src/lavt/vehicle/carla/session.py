@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from lavt.domain import Actuation, CameraModel
 from lavt.errors import UserError, VehicleError
-from lavt.vehicle.carla.actors import SpawnedActors
+from lavt.vehicle.carla.actors import SpawnedActors, find_blueprint, set_camera
 from lavt.vehicle.carla.connection import (
     OpenedWorld,
     connect,
@@ -228,7 +228,8 @@ class CarlaSession:
             self._client.set_timeout(CLOSE_TIMEOUT_S)
             if self._opened is not None:
                 if self._actors.are_new:
-                    self._advance(self._opened.world, CLOSE_TIMEOUT_S)
+                    with suppress(RuntimeError):  # without another state, it is worth trying
+                        self._advance(self._opened.world, CLOSE_TIMEOUT_S)
                 braked = self._carla.VehicleControl(brake=1.0, hand_brake=True)
                 self.is_car_gone = self._actors.destroy(self._opened.world, braked)
                 if self.is_car_gone and not self._is_ticked_by_another():
@@ -323,26 +324,11 @@ class CarlaSession:
             self._attach(self._blueprint(COLLISION), origin, self._note_collision)
             self._attach(self._blueprint(LANE_INVASION), origin, self._note_lane_invasion)
             if self.settings.camera is not None:
-                blueprint = self._camera_blueprint(self.settings.camera)
+                blueprint = self._blueprint(CAMERA)
+                set_camera(blueprint, self.settings.camera)
                 self._attach(blueprint, camera_mount(self.settings.camera, self._axles.rear_axle_m), self.pictures.put)
-        if self.settings.camera is None:
-            self.tick(BRAKED, hand_brake=True)  # the library may refuse to destroy a sensor that no state contains
-        else:
+        if self.settings.camera is not None:
             self._await_picture()
-
-    def _camera_blueprint(self, model: CameraModel) -> Any:
-        blueprint = self._blueprint(CAMERA)
-        attributes = {
-            "image_size_x": model.width_px,
-            "image_size_y": model.height_px,
-            "fov": math.degrees(model.field_of_view_rad),
-            "sensor_tick": 0.0,  # a picture in each tick; other values do not divide exactly
-            "motion_blur_intensity": 0.0,
-        }
-        for name, value in attributes.items():
-            if blueprint.has_attribute(name):
-                blueprint.set_attribute(name, str(value))
-        return blueprint
 
     def _await_picture(self) -> None:
         for _ in range(MAX_TICKS_TO_PICTURE):
@@ -360,13 +346,7 @@ class CarlaSession:
         sensor.listen(listener)
 
     def _blueprint(self, name: str) -> Any:
-        try:
-            blueprint = self._world.get_blueprint_library().find(name)
-        except IndexError:
-            raise UserError(f"the CARLA server has no {name!r}: set vehicle.carla.blueprint to another car") from None
-        if blueprint.has_attribute("role_name"):
-            blueprint.set_attribute("role_name", self.settings.role_name)
-        return blueprint
+        return find_blueprint(self._world, name, self.settings.role_name)
 
     def apply(self, actuation: Actuation, *, hand_brake: bool = False) -> None:
         """Put an actuation in force, without waiting for the server."""

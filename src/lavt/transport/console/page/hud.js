@@ -53,8 +53,10 @@ export function showSilence(silence_ms, isStopPending) {
   markOld(true);
   showSafety("");
   write("reason", "");
-  const [unconfirmed, unknown] = [`${STOP_NOT_CONFIRMED}, and ${silence}: use another emergency stop`, `${silence}: the page does not know what the vehicle does`];
-  write("hint", isStopPending ? unconfirmed : unknown);
+  const hint = isStopPending
+    ? `${STOP_NOT_CONFIRMED}, and ${silence}: use another emergency stop`
+    : `${silence}: the page does not know what the vehicle does`;
+  write("hint", hint);
 }
 
 function showSafety(name) {
