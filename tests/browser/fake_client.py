@@ -98,12 +98,12 @@ class FakeClient:
 
 
 def wait_until_loaded(tab: Tab, client: FakeClient) -> None:
-    """Wait until the page's modules have been executed, and it sends inputs."""
+    """Wait until the page is connected, which it needs to send anything, and sends inputs."""
 
     def is_loaded() -> bool:
         try:
-            return bool(tab.evaluate("'lavtConsole' in globalThis")) and client.inputs != []
+            return bool(tab.evaluate("globalThis.lavtConsole?.status?.role === 'drives'")) and client.inputs != []
         except ProtocolError:
             return False
 
-    wait_until("the page is loaded and sends inputs", is_loaded)
+    wait_until("the page is connected and sends inputs", is_loaded)
