@@ -17,7 +17,7 @@ from benchmarks.recomputing.runs import recompute_run
 from lavt.config import SweepConfig
 from lavt.config_file import load_config, shipped
 from lavt.experiment.runs.plan import plan_sweep
-from lavt.experiment.sweep.sweep import drive_sweep, open_sweep
+from lavt.experiment.sweep.sweep import drive_sweep
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SCRIPT = BENCHMARKS / "recompute.py"
@@ -36,8 +36,7 @@ CHANGES = (
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the directory of a small sweep."""
     config = load_config(SweepConfig, shipped("configs/paper.yaml"), CHANGES)
-    out: Path = tmp_path_factory.mktemp("sweep") / "out"
-    open_sweep(out, resume=False)
+    out: Path = tmp_path_factory.mktemp("sweep")
     drive_sweep(config, plan_sweep(config), out, jobs=2, on_progress=lambda _: None)
     return out
 

@@ -355,13 +355,16 @@ def test_report_of_a_boundary_without_a_sweep(run: Run, tmp_path: Path) -> None:
     assert list(files(tmp_path / "found")) == ["boundary.json"]
 
 
-def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:
-    """A sweep that was never started cannot be resumed."""
-    assert "never" in run("sweep", SWEEP, "--resume", "--out", "never").rejection()
-    assert files(tmp_path) == {}
+@pytest.mark.parametrize("command", [("sweep", SWEEP), ("boundary", BOUNDARY)])
+def test_nothing_to_resume(run: Run, tmp_path: Path, command: tuple[str, ...]) -> None:
+    """A sweep or a search that was never begun in a directory cannot be resumed there."""
+    (tmp_path / "photos").mkdir()
+    for name in ("never", "photos"):
+        assert f"nothing to resume in {name}" in run(*command, "--resume", "--out", name).rejection()
+    assert files(tmp_path) == {"photos": None}
 
 
-@pytest.mark.parametrize("command", [("sweep", SWEEP, "--resume"), ("boundary", BOUNDARY)])
+@pytest.mark.parametrize("command", [("sweep", SWEEP), ("boundary", BOUNDARY)])
 def test_two_commands_do_not_write_into_one_directory(run: Run, tmp_path: Path, command: tuple[str, ...]) -> None:
     """While a command drives a sweep or searches boundaries, another one for the same directory is rejected."""
     with reserve_directory(tmp_path):

@@ -51,5 +51,7 @@ def test_results_are_printed_and_written(run: Run, tmp_path: Path) -> None:
         "boundary.json",
         "boundary.png",
         "boundary.svg",
+        "boundary.yaml",
     }
     assert "a_key paper_calibrated 00: onset " in messages
+    assert run("boundary", BOUNDARY, *changes, "--out", str(out), "--resume", "--json")[:2] == (0, printed)

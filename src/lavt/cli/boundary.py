@@ -12,7 +12,7 @@ from lavt.cli.progress import progress
 from lavt.config import BoundaryConfig
 from lavt.config_file import load_config
 from lavt.errors import WorkError
-from lavt.recording.output_directory import disk_errors_named, prepare_directory, reserve_directory
+from lavt.recording.output_directory import disk_errors_named, open_directory, reserve_directory
 
 
 def register(app: typer.Typer) -> None:
@@ -25,32 +25,37 @@ def boundary(
     changes: console.SetOption = None,
     out: console.OutOption = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of parallel searches; default: one per core.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue a stopped search in --out.")] = False,
     as_json: console.JsonOption = False,
 ) -> None:
     """Find the maximum tolerable latency.
 
     The search finds the smallest total delays at which an oscillation grows (onset), the car leaves its lane
-    (departure), and the car no longer completes the route (completion). It compares the onset with theory.
+    (departure), and the car no longer completes the route (completion). It compares the onset with theory. Finished
+    searches of a stopped command are kept; see --resume.
 
     Example: lavt boundary configs/boundary.yaml --set 'routes=[a_key]' --out out/boundary
     """
     from lavt.experiment.boundary.boundary import plan_boundary, search_boundary  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.boundary.boundary_files import BOUNDARY_CONFIG, read_found  # noqa: PLC0415
 
     settings = load_config(BoundaryConfig, config, changes or [])
     searches = plan_boundary(settings)
     out = out or Path("out") / "boundary"
-    prepare_directory(out)
+    open_directory(out, BOUNDARY_CONFIG, resume=resume)
+    found = read_found(out)
+    remaining = sum(search.key not in found for search in searches)
     with (
         reserve_directory(out),
         console.interruptible("searches"),
         disk_errors_named(out),
-        progress(f"boundary search, results in {out}", len(searches)) as report_done,
+        progress(f"boundary search, results in {out}", remaining) as report_done,
     ):
         result, is_complete = search_boundary(settings, searches, out, jobs=jobs, on_progress=report_done)
     for failure in result["failed"]:
         console.print_message(f"failed: {failure['name']}: {failure['why']}")
     if not is_complete:
-        raise WorkError(f"stopped; the results so far are in {out}")
+        raise WorkError(f"stopped; the results so far are in {out}: continue with --resume")
     if as_json:
         console.print_json(result)
     else:

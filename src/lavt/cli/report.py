@@ -11,11 +11,9 @@ import typer
 from lavt.cli import console
 from lavt.cli.run_directories import find_runs, sweep_names
 from lavt.errors import UserError, WorkError
-from lavt.experiment.analysis.results import read_failed, read_json, read_result
+from lavt.experiment.analysis.results import read_failed, read_result
 from lavt.experiment.runs.run import RESULT, compute_result
 from lavt.recording.output_directory import disk_errors_named, make_directory
-
-BOUNDARY = "boundary.json"
 
 
 def register(app: typer.Typer) -> None:
@@ -37,11 +35,13 @@ def report(
     out = out or directories[0]
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is not a directory: name another with --out")
+    from lavt.experiment.boundary.boundary_files import BOUNDARY  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.report.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
     from lavt.experiment.report.side_by_side import side_by_side  # noqa: PLC0415 (the same)
 
-    boundaries = [_read_boundary(directory) for directory in directories if (directory / BOUNDARY).is_file()]
-    found_runs = {directory: find_runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
+    searched = [directory for directory in directories if (directory / BOUNDARY).is_file()]
+    boundaries = [_read_boundary(directory) for directory in searched]
+    found_runs = {directory: find_runs(directory) for directory in directories if directory not in searched}
     if not found_runs:
         raise UserError(f"{directories[0]} has a boundary but no runs: name the directory of a sweep, too")
     runs = [run for runs_in_directory in found_runs.values() for run in runs_in_directory]
@@ -91,8 +91,9 @@ def _read_answers(directories: Sequence[Path], names: dict[Path, str]) -> list[d
 
 
 def _read_boundary(directory: Path) -> dict[str, Any]:
-    boundary: Any = read_json(directory / BOUNDARY)
-    lists = [boundary.get(key) for key in ("runs", "groups")] if isinstance(boundary, dict) else []
-    if not lists or not all(isinstance(entries, list) and entries for entries in lists):
-        raise WorkError(f"{directory / BOUNDARY} has no runs or groups: search again with `lavt boundary`")
-    return dict(boundary)
+    from lavt.experiment.boundary.boundary_files import read_results  # noqa: PLC0415 (slow: scipy)
+
+    boundary = read_results(directory)
+    if not boundary["runs"]:
+        raise WorkError(f"no search in {directory} was finished: continue with `lavt boundary --resume`")
+    return boundary

@@ -13,7 +13,7 @@ from lavt.config import ClientConfig, SweepConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.experiment.runs.plan import plan_sweep
-from lavt.recording.output_directory import disk_errors_named, reserve_directory
+from lavt.recording.output_directory import disk_errors_named, open_directory, reserve_directory
 
 
 def register(app: typer.Typer) -> None:
@@ -49,7 +49,7 @@ def sweep(
     from lavt.assembly.vehicles import check_carla_servers  # noqa: PLC0415 (slow: numpy)
     from lavt.experiment.runs.remote_run import RemoteServer  # noqa: PLC0415
     from lavt.experiment.sweep.cluster import check_cluster  # noqa: PLC0415 (slow: scipy)
-    from lavt.experiment.sweep.sweep import drive_sweep, open_sweep  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.sweep.sweep import SWEEP, drive_sweep  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.sweep.workers import is_finished  # noqa: PLC0415
 
     if cluster and server:
@@ -72,7 +72,7 @@ def sweep(
         remote.check_connection()
     if remaining and not (remote or cluster):  # otherwise, the server may be reachable for other machines only
         check_carla_servers(run.config.vehicle for run in planned_runs)
-    open_sweep(out, resume=resume)
+    open_directory(out, SWEEP, resume=resume)
     with (
         reserve_directory(out),
         disk_errors_named(out),

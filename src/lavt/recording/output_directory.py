@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryFile
 
 from lavt.errors import UserError
 
@@ -39,17 +38,15 @@ def make_directory(out: Path) -> None:
         raise UserError(f"{out} cannot be created ({error.strerror}): name another directory with --out") from error
 
 
-def check_writable(out: Path) -> None:
-    """Raise `OSError` if no file can be written into the directory; leave none.
+def open_directory(out: Path, config: str, *, resume: bool) -> None:
+    """Create the directory of new work; with `resume`, check that it has the file `config`, which stopped work leaves.
 
-    Called before work whose results are written only at its end.
+    Raises `UserError` if there is nothing to resume, or if the directory cannot be created.
     """
-    try:
-        with TemporaryFile(dir=out) as file:
-            file.write(b"\0")
-            file.flush()
-    except OSError as error:  # it can name the temporary file
-        raise OSError(error.errno, error.strerror, str(out)) from error
+    if not resume:
+        prepare_directory(out)
+    elif not (out / config).is_file():
+        raise UserError(f"there is nothing to resume in {out}: omit --resume to begin")
 
 
 @contextmanager

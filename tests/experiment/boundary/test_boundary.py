@@ -26,7 +26,7 @@ from lavt.experiment.boundary.boundary import (
     is_not_completed,
     plan_boundary,
     run_search,
-    run_searches,
+    search_boundary,
     theoretical_ms,
     with_video_delay,
 )
@@ -249,6 +249,12 @@ def run_entry(route: str, repetition: int, **changes: Any) -> dict[str, Any]:
     }
 
 
+def entry_of(search: boundary_module.BoundarySearch) -> dict[str, Any]:
+    """Return an entry for a search, without running it."""
+    identity = search.planned.identity
+    return run_entry(identity["route"], identity["repetition"], preset=identity["preset"])
+
+
 RUNS = [
     *(run_entry("a", repetition) for repetition in range(6)),
     run_entry("b", 0, departure_ms=None, below=["departure"], not_monotone=["completion"]),
@@ -383,22 +389,30 @@ def test_departure_is_searched_where_drives_begin(monkeypatch: pytest.MonkeyPatc
     assert (run_search(search)["departure_ms"], run_search(search)["searched_ms"]) == (None, [10, 410])
 
 
-def test_a_failed_search_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def search_all(out: Path, *changes: str, jobs: int = 1, lines: list[str] | None = None) -> dict[str, Any]:
+    """Run all searches of a small search with these changes; return the content of `boundary.json`."""
+    config = small_search(*changes)
+    on_progress = (lambda _: None) if lines is None else lines.append
+    result, is_complete = search_boundary(config, plan_boundary(config), out, jobs=jobs, on_progress=on_progress)
+    assert is_complete
+    assert json.loads((out / "boundary.json").read_text()) == result
+    return result
+
+
+def test_a_failed_search_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A failed search is listed with its reason, and all other searches are completed."""
 
     def fake(search: boundary_module.BoundarySearch) -> dict[str, Any]:
         if search.name.endswith("01"):
             raise WorkError("the vehicle was never armed")
-        return run_entry("a_key", 0)
+        return entry_of(search)
 
     monkeypatch.setattr(boundary_module, "run_search", fake)
     monkeypatch.setattr("lavt.experiment.sweep.workers.process_workers", in_this_process)
     lines: list[str] = []
-    results, failed, completed = run_searches(
-        plan_boundary(small_search("repetitions=3")), jobs=1, on_progress=lines.append
-    )
-    assert (len(results), completed) == (2, True)
-    assert failed == [{"name": "a_key paper_calibrated 01", "why": "the vehicle was never armed"}]
+    result = search_all(tmp_path, "repetitions=3", lines=lines)
+    assert [run["repetition"] for run in result["runs"]] == [0, 2]
+    assert result["failed"] == [{"name": "a_key paper_calibrated 01", "why": "the vehicle was never armed"}]
     assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in lines
 
 
@@ -409,14 +423,12 @@ def submit_cancelled(*_: object) -> Future[Any]:
     return future
 
 
-def test_a_cancelled_search_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cancelled_search_has_failed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A search that was cancelled, as by a cluster that ends, is listed as failed and raises nothing."""
     monkeypatch.setattr("lavt.experiment.sweep.workers.process_workers", in_this_process)
     monkeypatch.setattr(_InThisProcess, "submit", submit_cancelled)
-    results, failed, completed = run_searches(
-        plan_boundary(small_search("repetitions=2")), jobs=1, on_progress=lambda _: None
-    )
-    assert (results, len(failed), completed) == ([], 2, True)
+    result = search_all(tmp_path, "repetitions=2")
+    assert (result["runs"], len(result["failed"])) == ([], 2)
 
 
 DEATHS = {0: 0, 1: 3, 2: 2}
@@ -431,24 +443,25 @@ def die_or_return_entry(search: boundary_module.BoundarySearch) -> dict[str, Any
     if deaths < DEATHS[repetition]:
         (folder / f"{repetition} {deaths}").touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return run_entry("a_key", repetition)
+    return entry_of(search)
 
 
 @pytest.mark.full
 def test_searches_of_a_dead_process_are_repeated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A search whose process dies is repeated twice; only a search whose processes died three times has failed."""
     monkeypatch.setattr(boundary_module, "run_search", die_or_return_entry)
-    searches = plan_boundary(small_search("repetitions=3", f"study.participant={tmp_path}"))
-    results, failed, completed = run_searches(searches, jobs=2, on_progress=lambda _: None)
-    assert [run["repetition"] for run in results] == [0, 2]
-    assert failed == [{"name": "a_key paper_calibrated 01", "why": "each of the processes that searched it died"}]
-    assert completed
+    out = tmp_path / "out"
+    out.mkdir()
+    result = search_all(out, "repetitions=3", f"study.participant={tmp_path}", jobs=2)
+    assert [run["repetition"] for run in result["runs"]] == [0, 2]
+    reason = "each of the processes that searched it died"
+    assert result["failed"] == [{"name": "a_key paper_calibrated 01", "why": reason}]
 
 
 @pytest.mark.parametrize("interrupts", [1, 2])
 def test_ctrl_c_keeps_the_found_boundaries(interrupts: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """After Ctrl-C, no search is started, and the files have all finished ones, also after a second Ctrl-C."""
-    monkeypatch.setattr(boundary_module, "run_search", lambda search: run_entry("a_key", int(search.name[-2:])))
+    monkeypatch.setattr(boundary_module, "run_search", entry_of)
     monkeypatch.setattr("lavt.experiment.sweep.workers.process_workers", in_this_process)
     monkeypatch.setattr(_InThisProcess, "max_calls", 3)
     lines: list[str] = []
@@ -461,7 +474,7 @@ def test_ctrl_c_keeps_the_found_boundaries(interrupts: int, monkeypatch: pytest.
             raise KeyboardInterrupt
 
     config = small_search("repetitions=5")
-    result, completed = boundary_module.search_boundary(
+    result, completed = search_boundary(
         config, plan_boundary(config), tmp_path, jobs=1, on_progress=interrupt_after_two
     )
     assert (len(lines), completed) == (3, False)
@@ -471,33 +484,66 @@ def test_ctrl_c_keeps_the_found_boundaries(interrupts: int, monkeypatch: pytest.
     assert (tmp_path / "boundary.png").stat().st_size > 1000
 
 
+def test_each_result_is_written_at_once_and_kept_by_a_resumed_search(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A killed search has lost only what was in progress; a resumed one runs the others, and has the same results."""
+    monkeypatch.setattr("lavt.experiment.sweep.workers.process_workers", in_this_process)
+    monkeypatch.setattr(boundary_module, "run_search", entry_of)
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    for out in (whole, killed):
+        out.mkdir()
+    lines: list[str] = []
+
+    def kill_at_second(line: str) -> None:
+        lines.append(line)
+        if len(lines) == 2:
+            raise Killed
+
+    config = small_search("repetitions=4")
+    with pytest.raises(Killed):
+        search_boundary(config, plan_boundary(config), killed, jobs=1, on_progress=kill_at_second)
+    found = json.loads((killed / "boundary.json").read_text())["runs"]
+    searched: list[int] = []
+
+    def note(search: boundary_module.BoundarySearch) -> dict[str, Any]:
+        entry = entry_of(search)
+        searched.append(entry["repetition"])
+        return entry
+
+    monkeypatch.setattr(boundary_module, "run_search", note)
+    resumed = search_all(killed, "repetitions=4")
+    assert (len(found), len(searched)) == (2, 2)
+    assert sorted([*searched, *(entry["repetition"] for entry in found)]) == [0, 1, 2, 3]
+    assert resumed == search_all(whole, "repetitions=4")
+
+
+def test_a_search_is_not_resumed_with_another_config(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A search is not resumed with another config, nor with damaged results; its files are not changed."""
+    monkeypatch.setattr("lavt.experiment.sweep.workers.process_workers", in_this_process)
+    monkeypatch.setattr(boundary_module, "run_search", entry_of)
+    search_all(tmp_path)
+    results = tmp_path / "boundary.json"
+    before = results.read_text()
+    with pytest.raises(UserError, match=r"another config \(within_ms\)"):
+        search_all(tmp_path, "within_ms=7")
+    assert results.read_text() == before
+    results.write_text('{"runs": [{"route": "a_key"}], "groups": []}')
+    with pytest.raises(WorkError, match=r"boundary.json has a run without 'preset'"):
+        search_all(tmp_path)
+
+
 def test_a_directory_that_cannot_be_written_is_named_before_the_first_search(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The results are written at the end of the searches, so a wrong directory ends the command before they begin."""
-    monkeypatch.setattr(boundary_module, "run_searches", lambda *_, **__: pytest.fail("the searches began"))
+    """The config is written first, so a wrong directory ends the command before the searches begin."""
+    monkeypatch.setattr(boundary_module, "attempt_in_processes", lambda *_: pytest.fail("the searches began"))
     with pytest.raises(OSError, match="absent"):
-        boundary_module.search_boundary(small_search(), [], tmp_path / "absent", jobs=1, on_progress=lambda _: None)
+        search_all(tmp_path / "absent")
 
 
-def test_ctrl_c_while_the_results_are_written_does_not_lose_them(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """A further Ctrl-C, which comes while the found boundaries are summarized, is raised after they are written."""
-    answers: list[Any] = [KeyboardInterrupt(), []]
-
-    def interrupted_once(_: object) -> list[Any]:
-        answer = answers.pop(0)
-        if isinstance(answer, KeyboardInterrupt):
-            raise answer
-        return list(answer)
-
-    entry = run_entry("a_key", 0)
-    monkeypatch.setattr(boundary_module, "run_searches", lambda *_, **__: ([entry], [], True))
-    monkeypatch.setattr(boundary_module, "summarize_groups", interrupted_once)
-    with pytest.raises(KeyboardInterrupt):
-        boundary_module.search_boundary(small_search(), [], tmp_path, jobs=1, on_progress=lambda _: None)
-    assert json.loads((tmp_path / "boundary.json").read_text())["runs"] == [entry]
+class Killed(BaseException):
+    """Ends a search as if its process had been killed."""
 
 
 def interrupt(*_: object, **__: object) -> None:

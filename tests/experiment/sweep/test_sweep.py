@@ -29,7 +29,7 @@ from lavt.errors import UserError
 from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import PlannedRun, plan_run, plan_sweep
 from lavt.experiment.runs.run import RESULT, run_once
-from lavt.experiment.sweep.sweep import base_of, drive_sweep, open_sweep, recorded_base, run_all
+from lavt.experiment.sweep.sweep import base_of, drive_sweep, recorded_base, run_all
 from lavt.experiment.sweep.workers import Workers, drive_or_read, process_workers
 
 CHANGES = ("fidelity=geometry", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
@@ -58,8 +58,7 @@ def two_runs() -> list[PlannedRun]:
 @pytest.fixture(scope="module")
 def sweep_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Drive a sweep of two runs in two processes, and return its directory."""
-    out = tmp_path_factory.mktemp("sweep") / "out"
-    open_sweep(out, resume=False)
+    out = tmp_path_factory.mktemp("sweep")
     drive_sweep(sweep_config(), two_runs(), out, jobs=2, on_progress=lambda _: None)
     return out
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import functools
 import itertools
 import math
@@ -14,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from lavt.config import BoundaryConfig, RunConfig
 from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError, WorkError, describe_error
-from lavt.experiment.analysis.results import write_json
 from lavt.experiment.boundary.bisection import Bracket, first_bracket, zero_bracket
+from lavt.experiment.boundary.boundary_files import BOUNDARY_CONFIG, SearchKey, read_found, search_key, write_results
 from lavt.experiment.boundary.compensation_margin import configured_margin_s
 from lavt.experiment.boundary.delay_margin import configured_loop, critical_delay_s
 from lavt.experiment.boundary.oscillation_growth import straight_growth
@@ -28,12 +28,11 @@ from lavt.experiment.report.boundary_section import boundary_figure
 from lavt.experiment.report.files import save_figure
 from lavt.experiment.runs.monitored_run import MonitoredRun, drive_monitored
 from lavt.experiment.runs.plan import PlannedRun, plan_run
-from lavt.experiment.statistics.boundary_summary import CRITERIA, summarize_groups
+from lavt.experiment.statistics.boundary_summary import CRITERIA
+from lavt.experiment.sweep.sweep import check_recorded_config
 from lavt.experiment.sweep.workers import Workers, attempt_in_processes, drives_alone
-from lavt.recording.output_directory import check_writable
+from lavt.recording.output_directory import replace_text
 
-BOUNDARY = "boundary.json"
-CSV_COLUMNS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
 SEARCH_KEYS = frozenset({"routes", "presets", "repetition", "repetitions", "longest_delay_ms", "grid_ms", "within_ms"})
 """The keys of a boundary config that are not keys of a run's config."""
 
@@ -57,6 +56,11 @@ class BoundarySearch:
     def name(self) -> str:
         """The name of the search, for messages."""
         return self.planned.name
+
+    @property
+    def key(self) -> SearchKey:
+        """The identity of the search among those of one config."""
+        return search_key(self.planned.identity)
 
 
 def plan_boundary(config: BoundaryConfig) -> list[BoundarySearch]:
@@ -150,10 +154,7 @@ def run_search(search: BoundarySearch) -> dict[str, Any]:
         "completion": (completion, total_ms),
     }
     return {
-        "route": identity["route"],
-        "preset": identity["preset"],
-        "seed": identity["seed"],
-        "repetition": identity["repetition"],
+        **{key: identity[key] for key in ("route", "preset", "seed", "repetition")},
         **{f"{name}_ms": _middle_ms(bracket, total_delay) for name, (bracket, total_delay) in brackets.items()},
         "theory_ms": theory_ms,
         "searched_ms": [first_total_ms, total_ms(grid_ms[-1])],
@@ -183,33 +184,51 @@ def theoretical_ms(config: RunConfig) -> float | None:
     return None if critical_s is None or math.isinf(critical_s) else critical_s * 1000
 
 
-def run_searches(
-    searches: Sequence[BoundarySearch], *, jobs: int | None, on_progress: ProgressCallback
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bool]:
-    """Run all searches, `jobs` at a time (None: one per core).
+def search_boundary(
+    config: BoundaryConfig,
+    searches: Sequence[BoundarySearch],
+    out: Path,
+    *,
+    jobs: int | None,
+    on_progress: ProgressCallback,
+) -> tuple[dict[str, Any], bool]:
+    """Run the searches of `config` that `out` has no result of, `jobs` at a time (None: one per core).
 
-    Returns the entries of the finished searches, in the order of `searches`; the failed searches with their reasons;
-    and whether all searches were run. On Ctrl-C, the searches in progress are finished, and no others are started.
+    `out` has the config, and the results so far in `boundary.json` and `.csv`; at the end, it also gets `boundary.svg`
+    and `.png`. On Ctrl-C, the searches in progress are finished, and no others are started. Returns the content of
+    `boundary.json`, and whether all searches were run. Raises `UserError` if `out` was begun with another config.
     """
-    progress, is_complete = _SearchProgress(on_progress), True
+    check_recorded_config(config, out / BOUNDARY_CONFIG)
+    replace_text(out / BOUNDARY_CONFIG, yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+    progress, is_complete = _SearchProgress(config, searches, out, on_progress), True
+    jobs = 1 if any(drives_alone(search.planned.config) for search in searches) else jobs or os.cpu_count() or 1
     try:
-        for search in attempt_in_processes(progress.search, searches, jobs or os.cpu_count() or 1):
+        for search in attempt_in_processes(progress.run, progress.todo, jobs):
             progress.fail(search, "each of the processes that searched it died")
     except KeyboardInterrupt:
         is_complete = False
-    found = [progress.found[search.name] for search in searches if search.name in progress.found]
-    return found, progress.failed, is_complete
+    content = progress.write()
+    if content["runs"]:
+        save_figure(out, "boundary", boundary_figure(content), "boundaries", "")
+    return content, is_complete
 
 
 class _SearchProgress:
-    """The finished and the failed searches so far."""
+    """The finished and the failed searches so far, which are also in the files of a directory."""
 
-    def __init__(self, on_progress: ProgressCallback) -> None:
-        self.found: dict[str, dict[str, Any]] = {}
-        self.failed: list[dict[str, Any]] = []
-        self._on_progress = on_progress
+    def __init__(
+        self, config: BoundaryConfig, searches: Sequence[BoundarySearch], out: Path, on_progress: ProgressCallback
+    ) -> None:
+        self._config, self._searches, self._out, self._on_progress = config, searches, out, on_progress
+        self._found = read_found(out)
+        self._failed: list[dict[str, Any]] = []
 
-    def search(self, workers: Workers, todo: Sequence[BoundarySearch]) -> list[BoundarySearch]:
+    @property
+    def todo(self) -> list[BoundarySearch]:
+        """The searches without a result."""
+        return [search for search in self._searches if search.key not in self._found]
+
+    def run(self, workers: Workers, todo: Sequence[BoundarySearch]) -> list[BoundarySearch]:
         """Run the searches `todo`; return, in their order, the ones that have no result because a process died."""
         futures = {workers.executor.submit(run_search, search): search for search in todo}
         broken: set[str] = set()
@@ -217,12 +236,13 @@ class _SearchProgress:
         def take(future: Future[dict[str, Any]]) -> None:
             search, error = futures[future], None
             try:
-                self.found[search.name] = future.result()
+                self._found[search.key] = future.result()
             except Exception as raised:  # an error of one search does not end the others
                 error = raised
             del futures[future]  # only now: a Ctrl-C before this line must not lose the result
             if error is None:
-                self._on_progress(f"{search.name}: {_format_boundaries(self.found[search.name])}")
+                self.write()
+                self._on_progress(f"{search.name}: {_format_boundaries(self._found[search.key])}")
             elif isinstance(error, BrokenExecutor):
                 broken.add(search.name)
             else:
@@ -242,8 +262,13 @@ class _SearchProgress:
 
     def fail(self, search: BoundarySearch, reason: str) -> None:
         """Add a failed search."""
-        self.failed.append({"name": search.name, "why": reason})
+        self._failed.append({"name": search.name, "why": reason})
         self._on_progress(f"{search.name}: failed: {reason}")
+
+    def write(self) -> dict[str, Any]:
+        """Write the results so far, in the order of the searches, and return the content of `boundary.json`."""
+        found = [self._found[search.key] for search in self._searches if search.key in self._found]
+        return write_results(self._config, found, self._failed, self._out)
 
 
 def _format_boundaries(found: Mapping[str, Any]) -> str:
@@ -252,47 +277,3 @@ def _format_boundaries(found: Mapping[str, Any]) -> str:
         f"{name} {'-' if found[f'{name}_ms'] is None else format(found[f'{name}_ms'], '.0f')}" for name in CRITERIA
     ]
     return ", ".join(parts) + " ms"
-
-
-def search_boundary(
-    config: BoundaryConfig,
-    searches: Sequence[BoundarySearch],
-    out: Path,
-    *,
-    jobs: int | None,
-    on_progress: ProgressCallback,
-) -> tuple[dict[str, Any], bool]:
-    """Run the searches of `config`, and write `boundary.json`, `.csv`, `.svg` and `.png` into `out`, also after Ctrl-C.
-
-    Returns the content of `boundary.json`, and whether all searches were run.
-    """
-    check_writable(out)
-    jobs = 1 if any(drives_alone(search.planned.config) for search in searches) else jobs
-    found, failed, is_complete = run_searches(searches, jobs=jobs, on_progress=on_progress)
-    try:
-        content = _write_results(config, found, failed, out)
-    except KeyboardInterrupt:  # a further Ctrl-C must not cost the results of hours
-        _write_results(config, found, failed, out)
-        raise
-    if found:
-        save_figure(out, "boundary", boundary_figure(content), "boundaries", "")
-    return content, is_complete
-
-
-def _write_results(
-    config: BoundaryConfig, found: list[dict[str, Any]], failed: list[dict[str, Any]], out: Path
-) -> dict[str, Any]:
-    """Write `boundary.json` and `boundary.csv`, and return the content of `boundary.json`."""
-    content = {
-        "schema": 1,
-        "config": config.model_dump(mode="json"),
-        "runs": found,
-        "groups": summarize_groups(found),
-        "failed": failed,
-    }
-    write_json(out / BOUNDARY, content)
-    with (out / "boundary.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, CSV_COLUMNS, extrasaction="ignore")
-        writer.writeheader()
-        writer.writerows(found)
-    return content

@@ -35,7 +35,7 @@ from lavt.experiment.sweep.workers import (
     is_finished,
     remove_unfinished,
 )
-from lavt.recording.output_directory import prepare_directory, replace_text
+from lavt.recording.output_directory import replace_text
 
 SWEEP = "sweep.yaml"
 """The file with the complete config of a sweep, in the sweep's directory."""
@@ -147,17 +147,6 @@ class _SweepProgress:
         """Add a failed run."""
         self.failed.append((planned.name, reason))
         self._on_progress(f"{planned.name} failed: {reason}")
-
-
-def open_sweep(out: Path, *, resume: bool) -> None:
-    """Create the directory of a new sweep, or check that the directory of a sweep to resume exists.
-
-    Raises `UserError` if there is no sweep to resume, or if the directory of a new sweep cannot be created.
-    """
-    if resume and not out.is_dir():
-        raise UserError(f"there is nothing to resume in {out}: omit --resume to begin")
-    if not resume:
-        prepare_directory(out)
 
 
 def drive_sweep(
