@@ -5,6 +5,7 @@ from msgspec.structs import replace
 
 from lavt.cli.session_log import (
     FIRST_STATE_TIMEOUT_NS,
+    MAX_SERVERS,
     NO_STATE_YET,
     STATE_AGAIN,
     SessionLog,
@@ -104,6 +105,32 @@ def test_each_change_is_logged_once() -> None:
     log.set_ending(None)
     log.set_ending("completed")
     assert log.take_lines(NS_PER_S + STATE_PERIOD_NS) == [ending]
+
+
+def test_alternating_states_of_two_servers_are_logged_once() -> None:
+    """If two servers have the same name, each change of either vehicle is logged once, not with every state."""
+    log, other = SessionLog("operator-1"), replace(STATE, instance=8)
+    for number in range(50):
+        log.add_state(DRIVING, number * STATE_PERIOD_NS, has_control=True)
+        log.add_state(other, number * STATE_PERIOD_NS, has_control=True)
+    lines = log.take_lines(NS_PER_S)
+    assert lines.count("the server has restarted") == 1
+    assert len(lines) == len(set(lines))
+    log.add_state(replace(DRIVING, safety="safe_stop", reason="why"), NS_PER_S, has_control=True)
+    log.add_state(other, NS_PER_S, has_control=True)
+    assert log.take_lines(NS_PER_S) == ["safe_stop: why"]
+
+
+def test_many_servers_are_not_remembered_without_limit() -> None:
+    """The log remembers the states of a limited number of servers."""
+    log = SessionLog("operator-1")
+    for instance in range(3 * MAX_SERVERS):
+        log.add_state(replace(STATE, instance=instance), 0)
+    log.take_lines(0)
+    log.add_state(replace(STATE, instance=3 * MAX_SERVERS - MAX_SERVERS), 0)
+    assert log.take_lines(0) == []
+    log.add_state(replace(STATE, instance=0), 0)
+    assert log.take_lines(0) == ["the server has restarted"]
 
 
 def test_rejections_are_logged_at_most_once_a_second_with_their_count() -> None:

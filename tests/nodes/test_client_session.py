@@ -4,7 +4,7 @@ import pytest
 from msgspec.structs import replace
 
 from lavt.domain import NS_PER_S, Now, SafetyState, SessionReply, State
-from lavt.nodes.client_session import ClientSession
+from lavt.nodes.client_session import RESTART_HINT, SAME_NAME, ClientSession
 from lavt.safety.session import CLEARED_BEFORE, RELEASED_BEFORE
 from lavt.safety.state_machine import TRIGGER_MESSAGES
 
@@ -132,6 +132,47 @@ def test_rearm_requests_control_from_a_restarted_server(stopped: bool) -> None:
     session.handle_state(replace(state("disarmed"), instance=2), 700)
     assert session.phase == "seeking"
     assert session.take_request(700) is not None
+
+
+@pytest.mark.parametrize("rearm", [False, True])
+def test_two_servers_of_one_name_await_a_person(rearm: bool) -> None:
+    """If the states of two servers alternate, the client stops and does not arm, even with `rearm`."""
+    session = driving_session(rearm=rearm)
+    for time_ns in range(500, 900, 100):
+        session.handle_state(replace(state("disarmed"), instance=2), time_ns)
+        session.handle_state(state("driving", 5.0), time_ns + 50)
+    assert (session.phase, session.reason) == ("stopped", SAME_NAME + RESTART_HINT)
+    session.handle_state(state("safe_stop"), 1000)
+    session.handle_reply(GRANTED, 1100)
+    assert (session.phase, session.may_command, session.take_request(10 * NS_PER_S)) == ("stopped", False, None)
+
+
+def test_a_client_that_waits_for_one_of_two_servers_does_not_arm() -> None:
+    """A client that sees two servers of one name before it drives does not arm either of them."""
+    session = new_session()
+    for time_ns, instance in enumerate((1, 2, 1)):
+        session.handle_reply(GRANTED, time_ns)
+        session.handle_state(replace(state("disarmed"), instance=instance), time_ns)
+    assert (session.phase, session.reason) == ("stopped", SAME_NAME + RESTART_HINT)
+
+
+def test_a_stop_of_two_servers_is_the_last_reason() -> None:
+    """After an emergency stop of two servers of one name, the reason does not alternate between stop and name."""
+    session = new_session()
+    for instance in (1, 2, 1):
+        session.handle_state(replace(state("disarmed"), instance=instance), 100)
+    for instance in (2, 1, 2, 1):
+        session.handle_state(replace(state("emergency_stop"), instance=instance), 200)
+        assert session.reason == "reason" + RESTART_HINT
+
+
+def test_a_server_that_restarts_twice_is_one_server() -> None:
+    """Restarts of one server, each with a new instance, do not count as several servers."""
+    session = driving_session(rearm=True)
+    for instance in (2, 3, 4):
+        session.handle_state(replace(state("disarmed"), instance=instance), 500)
+        session.handle_state(replace(state("disarmed"), instance=instance), 600)
+    assert session.phase == "seeking"
 
 
 def test_an_emergency_stop_has_a_new_number() -> None:

@@ -16,6 +16,8 @@ STATE_TIMEOUT_NS = NS_PER_S
 """A client logs that the state is missing after this time; the vehicle sends its state 50 times a second."""
 FIRST_STATE_TIMEOUT_NS = 3 * NS_PER_S
 """The timeout before the first state; it is longer, because the routers need time to find each other."""
+MAX_SERVERS = 8
+"""The number of server processes whose last states are remembered."""
 NO_STATE_YET = (
     "no state from the vehicle yet: is its server running, do the routers reach each other, and do the keys match? "
     "Run `lavt doctor CONFIG` to find out"
@@ -92,6 +94,8 @@ class SessionLog:
         self._client_name = client_name
         self._lines: list[str] = []
         self._state: State | None = None
+        self._states: dict[int, State] = {}
+        """The last state of each server process, by its instance: if two have the same name, their states alternate."""
         self._logged_phase = ""
         self._logged_ending: str | None = None
         self._start_ns: int | None = None
@@ -106,7 +110,10 @@ class SessionLog:
         if self._state_missing and self._state_ns is not None:
             self._lines.append(STATE_AGAIN)
         self._state_missing, self._state_ns = False, now_ns
-        before, self._state = self._state, state
+        before, self._state = self._states.pop(state.instance, self._state), state
+        self._states[state.instance] = state
+        if len(self._states) > MAX_SERVERS:
+            self._states.pop(next(iter(self._states)))
         self._lines += state_lines(before, state, operator=self._client_name if has_control else "")
         for limit in state.limited.split(", ") if state.limited else ():
             if now_ns - self._limit_applied_ns.get(limit, now_ns - REPEAT_NS) >= REPEAT_NS:

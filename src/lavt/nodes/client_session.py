@@ -16,6 +16,7 @@ lost for good."""
 
 REQUEST_PERIOD_NS = NS_PER_S
 RESTART_HINT = "; restart this client to drive"
+SAME_NAME = "several servers have this vehicle's name: end all but one, or give each another vehicle_id"
 
 
 class ClientSession:
@@ -24,8 +25,9 @@ class ClientSession:
     With `rearm`, it requests control again after a safe stop and from a restarted server. With `clear_stop`, it clears
     the emergency stop that the first reply reports, and no other one. After any other emergency stop, and after a
     driver override, it never arms the vehicle again: not if it has not driven yet, if somebody clears the stop, or if
-    the server restarts and has forgotten the stop. With `waits_for_condition`, it arms the vehicle only when the
-    network condition is in force. With `take_over`, it requests a handover from the active operator.
+    the server restarts and has forgotten the stop. The same holds if states of two servers alternate: they have the
+    same name, and each has another vehicle. With `waits_for_condition`, it arms the vehicle only when the network
+    condition is in force. With `take_over`, it requests a handover from the active operator.
     """
 
     def __init__(
@@ -71,6 +73,10 @@ class ClientSession:
         """A state has named this client as the active operator."""
         self._server = 0
         """Instance of the server process that sent the last state."""
+        self._former_server: int | None = None
+        """Instance of the server process that sent states before that one; None: there was none."""
+        self._has_two_servers = False
+        """The states of two servers have alternated."""
         self._state_reason = ""
         """Reason in the last state."""
         self._awaits_person = False
@@ -172,6 +178,7 @@ class ClientSession:
     def handle_state(self, state: State, now_ns: int) -> None:
         """Process a state of the vehicle."""
         self._notice_stop(state)
+        self._notice_other_server(state)
         self.safety, self._server, self._state_reason = state.safety, state.instance, state.reason
         names_this_client = (state.active_operator, state.active_operator_instance) == (self._who, self._instance)
         names_other_client = state.active_operator != "" and not names_this_client
@@ -203,7 +210,8 @@ class ClientSession:
         if self.safety == "":  # the first state can tell of what happened before this client started
             return
         is_restarted = state.instance != self._server
-        if is_restarted and self.safety == "emergency_stop" and not self._looks_for_stop:
+        forgets_stop = is_restarted and not self._has_two_servers
+        if forgets_stop and self.safety == "emergency_stop" and not self._looks_for_stop:
             self._await_person("the server has restarted in an emergency stop")
         if state.safety == "disarmed":
             is_new = is_restarted or (self.safety, self._state_reason) != ("disarmed", state.reason)
@@ -211,6 +219,15 @@ class ClientSession:
             ends_drive = not is_restarted and self.safety != "disarmed" and self.phase in ("driving", "stopped")
             if is_override or ends_drive:
                 self._await_person(state.reason)
+
+    def _notice_other_server(self, state: State) -> None:
+        """Notice that two servers have the same name: a server that has restarted never sends a state again."""
+        if self.safety == "" or state.instance == self._server:
+            return
+        if state.instance == self._former_server and not self._has_two_servers:
+            self._has_two_servers = True
+            self._await_person(SAME_NAME)
+        self._former_server = self._server
 
     def _await_person(self, reason: str) -> None:
         """Do not arm the vehicle from now on: a person must decide what follows, and restart this client."""
