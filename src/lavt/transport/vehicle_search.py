@@ -22,7 +22,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S, VehicleInfo
 from lavt.errors import BadMessage
 from lavt.transport.messages import NAME, VERSION, decode, decode_versions
 from lavt.transport.security.keys import SIGNATURE_BYTES
-from lavt.transport.zenoh_config import SessionSettings, check_endpoints, check_private_keys, error_text
+from lavt.transport.zenoh_config import SessionSettings, check_endpoints, check_tls_files, error_text
 from lavt.transport.zenoh_session import RouterUnreachable, close_session, load_zenoh_config, open_zenoh
 
 KEY: Final = re.compile(rf"lavt/({NAME.pattern.removeprefix('^').removesuffix(chr(92) + 'Z')})/info\Z")
@@ -149,7 +149,7 @@ class SearchSession:
         limits = {"transport/link/rx/max_message_size": MAX_MESSAGE_BYTES, "adminspace/enabled": False}
         config = load_zenoh_config(settings.path, {**settings.changes, **limits})
         endpoints = check_endpoints(config, "the router")
-        check_private_keys(config)
+        check_tls_files(config)
         self.router: str = ", ".join(endpoints)
         try:
             self._session: Any = open_zenoh(config)

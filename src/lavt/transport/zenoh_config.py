@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+import ssl
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ from lavt.errors import UserError
 
 PRIVATE_KEYS = ("transport/link/tls/listen_private_key", "transport/link/tls/connect_private_key")
 """Config keys of private key files; Zenoh does not check their permissions."""
+TLS = "transport/link/tls/"
+"""The beginning of the config keys of certificates and private keys."""
+TLS_PROTOCOLS = ("tls", "quic")
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
 """Protocols of endpoints with a host and a port. They are checked here, because Zenoh reports an unknown protocol as
 unreachable."""
@@ -41,6 +45,56 @@ def check_private_keys(config: Any) -> None:
             raise UserError(
                 f"other users may read the private key {file}: chmod 600 it, and make new keys if somebody has read it"
             )
+
+
+def check_tls_files(config: Any) -> None:
+    """Raise `UserError` if a certificate or a private key that the config's endpoints need cannot be used.
+
+    Zenoh does not name the file, and a router that only dials would try again for ever, without a message.
+    """
+    check_private_keys(config)
+    used = [kind for kind in ("listen", "connect") if _uses_tls(config, kind)]
+    if not used:
+        return
+    authority = _tls_file(config, "root_ca_certificate")
+    if authority is not None:
+        _try_ssl(f"{authority} is not a file of certificates", lambda context: context.load_verify_locations(authority))
+    for kind in used:
+        pair = _tls_file(config, f"{kind}_certificate"), _tls_file(config, f"{kind}_private_key")
+        if None not in pair:
+            _try_ssl(f"{pair[0]} and {pair[1]} are not a certificate and its private key", _load(*pair))
+
+
+def _uses_tls(config: Any, kind: str) -> bool:
+    """Return whether an endpoint at which the config listens, or that it connects to, needs certificates."""
+    endpoints = config.get_json(f"{kind}/endpoints")
+    return any(f'"{protocol}/' in endpoints for protocol in TLS_PROTOCOLS)
+
+
+def _tls_file(config: Any, name: str) -> str | None:
+    """Return the path of a file of the config, None if it names none; raise `UserError` if it cannot be read."""
+    file: str | None = json.loads(config.get_json(TLS + name))
+    try:
+        if file is not None:
+            Path(file).read_bytes()
+    except OSError as error:
+        raise UserError(
+            f"{file} cannot be read ({error.strerror}): copy it here from the machine with the authority, or correct "
+            f"transport.link.tls.{name} (docs/security.md)"
+        ) from error
+    return file
+
+
+def _load(certificate: Any, key: Any) -> Callable[[ssl.SSLContext], None]:
+    """Return a function that loads a certificate and its key; an encrypted key is an error, not a prompt."""
+    return lambda context: context.load_cert_chain(certificate, key, password=bytes)
+
+
+def _try_ssl(what: str, load: Callable[[ssl.SSLContext], None]) -> None:
+    try:
+        load(ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT))
+    except (ssl.SSLError, ValueError) as error:
+        raise UserError(f"{what}: copy what `lavt keys` has made again (docs/security.md)") from error
 
 
 def error_text(error: BaseException) -> str:

@@ -23,7 +23,7 @@ from lavt.errors import UserError
 from lavt.node import Send
 from lavt.transport.messages import NAME
 from lavt.transport.router_check import RouterCheck, Routers, end_process_later, parse_locators, parse_routers
-from lavt.transport.zenoh_config import SessionSettings, check_endpoints, check_private_keys, error_text
+from lavt.transport.zenoh_config import SessionSettings, check_endpoints, check_tls_files, error_text
 from lavt.transport.zenoh_session import (
     RouterUnreachable,
     close_session,
@@ -140,7 +140,7 @@ class ZenohLink:
     def _open_session(self, settings: SessionSettings) -> None:
         self._config = load_zenoh_config(settings.path, settings.changes)
         endpoints = check_endpoints(self._config, "zenoh.router")
-        check_private_keys(self._config)
+        check_tls_files(self._config)
         try:
             self._session = open_zenoh(self._config)
         except zenoh.ZError as error:

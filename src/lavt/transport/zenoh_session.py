@@ -19,7 +19,7 @@ from lavt.transport.router_check import (
     end_process_later,
     parse_locators,
 )
-from lavt.transport.zenoh_config import check_endpoints, check_private_keys, error_text
+from lavt.transport.zenoh_config import check_endpoints, check_tls_files, error_text
 
 
 class RouterUnreachable(UserError):
@@ -80,7 +80,7 @@ def open_router(path: Path, changes: Mapping[str, Any], *, must_listen: bool) ->
     if not json.loads(config.get_json("adminspace/enabled")):
         raise UserError(f"set adminspace: {{ enabled: true }} in {path}, or the router cannot report where it listens")
     check_endpoints(config, "connect.endpoints")
-    check_private_keys(config)
+    check_tls_files(config)
     try:
         return open_zenoh(config)
     except zenoh.ZError as error:
