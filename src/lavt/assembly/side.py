@@ -28,7 +28,7 @@ from lavt.assembly.nodes import AGENT_ELSEWHERE, build_client, build_server
 from lavt.assembly.rendezvous import open_flow
 from lavt.assembly.security import Authenticator, build_authenticator, build_gateway
 from lavt.assembly.vehicles import VehicleSetup
-from lavt.assembly.zenoh import side_session
+from lavt.assembly.zenoh import check_certificates, side_session
 from lavt.clock import Clock
 from lavt.config import AGENT, HUMAN, ClientConfig, ServerConfig
 from lavt.domain import Now
@@ -318,6 +318,8 @@ def _prepare(
     if out is not None:
         check_directory(out)
     authenticator = build_authenticator(config, clock.now().wall_ns)
+    if config.security.key:
+        check_certificates(side_session(config), clock.now().wall_ns)
     queues = NetemInterface(config.injection.interface) if config.injection.interface else None
     for message in () if queues is None else queues.check():
         print_message(message)

@@ -13,8 +13,8 @@ from lavt.assembly.entropy import MachineEntropy
 from lavt.config import ClientConfig, ServerConfig, ZenohConfig
 from lavt.config_file import build_config, find_file, load_config
 from lavt.errors import UserError
-from lavt.transport.zenoh_config import SessionSettings, flatten, with_host
-from lavt.transport.zenoh_session import configured_endpoints
+from lavt.transport.zenoh_config import SessionSettings, flatten, used_certificates, with_host
+from lavt.transport.zenoh_session import configured_endpoints, load_zenoh_config
 
 CONFIG_SUFFIXES: Final = (".yaml", ".yml")
 SESSION_FILE = "zenoh-configs/session.json5"
@@ -60,6 +60,19 @@ def side_session(config: Config) -> SessionSettings:
     if not config.zenoh.is_embedded:
         return _separate(config)
     return SessionSettings(_router_file(config), _router_changes(config), is_router=True)
+
+
+def check_certificates(settings: SessionSettings, now_wall_ns: int) -> None:
+    """Raise `UserError` for a certificate of a session that has expired: peers would reject it without a message.
+
+    Nothing is checked without the package `cryptography`, which is an extra.
+    """
+    try:
+        from lavt.transport.security.certificates import check_expiry  # noqa: PLC0415 (an extra)
+    except ImportError:
+        return
+    for path in used_certificates(load_zenoh_config(settings.path, settings.changes)):
+        check_expiry(path, now_wall_ns)
 
 
 def program_sessions(config: Config) -> list[SessionSettings]:

@@ -65,6 +65,12 @@ def check_tls_files(config: Any) -> None:
             _try_ssl(f"{pair[0]} and {pair[1]} are not a certificate and its private key", _load(*pair))
 
 
+def used_certificates(config: Any) -> list[Path]:
+    """Return the files of the certificates that the config's endpoints need."""
+    files = [_tls_file(config, f"{kind}_certificate") for kind in ("listen", "connect") if _uses_tls(config, kind)]
+    return [Path(file) for file in files if file is not None]
+
+
 def _uses_tls(config: Any, kind: str) -> bool:
     """Return whether an endpoint at which the config listens, or that it connects to, needs certificates."""
     endpoints = config.get_json(f"{kind}/endpoints")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ipaddress
 import re
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Final, TypeVar
 
 from cryptography import x509
@@ -127,6 +128,14 @@ def days_left(certificate: bytes, where: str, now_wall_ns: int) -> float:
         _load_certificate(certificate, where).not_valid_after_utc.timestamp() * NS_PER_S / NS_PER_DAY
         - now_wall_ns / NS_PER_DAY
     )
+
+
+def check_expiry(path: Path, now_wall_ns: int) -> None:
+    """Raise `UserError` for a certificate that has expired, or that is not one."""
+    data = path.read_bytes()
+    if days_left(data, str(path), now_wall_ns) <= 0:
+        day = summarize(data, str(path)).expires
+        raise UserError(f"the certificate {path} expired on {day}: make new keys with `lavt keys DIR`")
 
 
 def is_host(text: str) -> bool:
