@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+import signal
+from pathlib import Path
 from typing import Any
 
+import pytest
 from rich.console import Console
 
+from lavt.cli import demo as demo_command
 from lavt.cli.demo import closing_sentences, describe_ending, own_lane_text, summary_table
 from lavt.cli.live_view import _status_line
+from lavt.errors import WorkError
 
 
 def run_of(condition: str, time: str = "real", *, kept: bool | None = True, **changes: Any) -> dict[str, Any]:
@@ -94,3 +99,18 @@ def test_the_live_view_shows_what_the_driver_sees() -> None:
     assert "28.8 km/h" in _status_line(server, {})
     assert "lane seen  71 %" in _status_line(server, {"lane_confidence": 0.71})
     assert "no lane seen" in _status_line(server, {"lane_confidence": 0.0})
+
+
+def test_ctrl_c_in_the_virtual_part_says_what_is_finished(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Ctrl-C during the runs in virtual time says that the runs in progress are finished first."""
+
+    def interrupt(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(demo_command, "_drive_real", lambda *_: None)
+    monkeypatch.setattr(demo_command, "_drive_virtual", interrupt)
+    with pytest.raises(WorkError, match="stopped"):
+        demo_command.demo(tmp_path / "out")
+    assert "finishing the runs in progress; Ctrl-C again ends at once" in capsys.readouterr().err

@@ -59,6 +59,7 @@ def demo(out: console.OutOption = None, as_json: console.JsonOption = False) -> 
             console.print_message(f"the part in real time needs Linux (this system has no {missing}), and is left out")
         else:
             _drive_real(config, out)
+    with console.interruptible("runs"), disk_errors_named(out):
         sweep_result, speed = _drive_virtual(config, out)
     from lavt.experiment.report.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
 
