@@ -46,7 +46,7 @@ def drive(
     config, clock = drive_config(changes or []), MachineClock()
     if out is not None:
         check_directory(out)
-    with start_human_drive(config, out, clock) as human_drive:
+    with console.closing_on_signals(), start_human_drive(config, out, clock) as human_drive:
         client = human_drive.client.model_copy(update={"console": ConsoleConfig(port=port)})
         own_out = None if out is None else out / "client"
         with open_client(
