@@ -222,12 +222,18 @@ def test_unknown_key_without_a_near_one(tmp_path: Path) -> None:
         ("seed=2026-13-45", "not YAML"),
         ("seed=!!int x", "not YAML"),
         ("seed.more=1", "seed is not a section"),
-        ("camera=3", "'camera'"),
+        ("camera=3", "'camera' is a section"),
     ],
 )
 def test_invalid_changes_are_rejected(change: str, reason: str, tmp_path: Path) -> None:
     """A change by --set is validated like the file; the error names the key or the right form of a change."""
     assert reason in rejection("seed: 1", tmp_path, changes=(change,))
+
+
+def test_the_advice_for_a_change_below_a_value_has_the_whole_key(tmp_path: Path) -> None:
+    """The message for a change below a key that has a value names the whole key, so that the advice can be used."""
+    sentence = rejection("network: {condition: L0}", tmp_path, changes=("network.condition.L3=1",))
+    assert "network.condition is not a section: write --set network.condition=value" in sentence
 
 
 def test_changes_reach_nested_keys(tmp_path: Path) -> None:
@@ -264,7 +270,12 @@ BAD_VALUES: list[tuple[type[Section], str, str]] = [
     (RunConfig, "camera: {z_m: .inf}", "'camera.z_m'"),
     (RunConfig, "camera: {pitch_deg: 90}", "'camera.pitch_deg'"),
     (RunConfig, "camera: null", "'camera'"),
-    (RunConfig, "camera: [640, 480]", "'camera'"),
+    (RunConfig, "camera: [640, 480]", "'camera' is a section"),
+    (
+        RunConfig,
+        "network: L3",
+        "'network' is a section, not a value such as 'L3': set its keys, such as network.condition",
+    ),
     (RunConfig, "network: {injection: magic}", "'network.injection'"),
     (RunConfig, "network: {inherent: ether}", "'network.inherent'"),
     (RunConfig, "network: {video: {loss: 1.0}}", "'network.video.loss'"),

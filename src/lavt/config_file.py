@@ -146,10 +146,11 @@ def condition(name: str) -> Condition:
 
 def _apply_change(data: dict[str, Any], change: str) -> None:
     (*sections, last), value = split_change(change)
-    for section in sections:
+    for depth, section in enumerate(sections, start=1):
         data = data.setdefault(section, {})
         if not isinstance(data, dict):
-            raise UserError(f"--set {change!r}: {section} is not a section: write --set {section}=value")
+            key = ".".join(sections[:depth])
+            raise UserError(f"--set {change!r}: {key} is not a section: write --set {key}=value")
     data[last] = value
 
 
@@ -190,6 +191,8 @@ def _describe(kind: type[BaseModel], problem: Any) -> str:
         return f"unknown key {key!r}: {hint}"
     if problem["type"] == "missing":
         return f"{key!r} is missing: add it"
+    if problem["type"] == "model_type" and (known := _keys(kind, location)):
+        return f"{key!r} is a section, not a value such as {problem['input']!r}: set its keys, such as {key}.{known[0]}"
     if problem["type"] == "tuple_type":
         return f"{key!r}: write a list, such as [a, b], not {problem['input']!r}"
     if problem["type"] == "float_type" and (number := _parse_float(problem["input"])) is not None:
