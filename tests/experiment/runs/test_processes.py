@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from lavt.errors import WorkError
 from lavt.experiment.runs import processes
 from lavt.experiment.runs.processes import Process
 
@@ -50,6 +51,14 @@ def test_a_process_that_holds_the_output_open_delays_no_end(tmp_path: Path, monk
     finally:
         os.kill(child, signal.SIGKILL)
         process._reader.join(WAIT_S)
+
+
+def test_a_process_that_is_killed_during_its_start_names_the_signal(tmp_path: Path) -> None:
+    """If a signal ends a process before it is ready, as for lack of memory, the error gives the signal."""
+    process = Process("child", (), tmp_path, ("-c", "import os; os.kill(os.getpid(), 9)"))
+    with pytest.raises(WorkError, match="child was ended by signal 9 during its start: no message"):
+        process.wait_ready()
+    process.end()
 
 
 def test_a_deleted_log_has_no_last_message(tmp_path: Path) -> None:

@@ -67,9 +67,11 @@ class Process:
         except queue.Empty:
             raise WorkError(f"{self.name} did not get ready within {READY_LIMIT_S:.0f} s") from None
         if line is None:
-            if self.popen.wait() == USER_ERROR_CODE:
+            code = self.popen.wait()
+            if code == USER_ERROR_CODE:
                 raise UserError(self.last_message().removeprefix("lavt: "))
-            raise WorkError(f"{self.name} did not start: {self.last_message()}")
+            ended = f"was ended by signal {-code} during its start" if code < 0 else "did not start"
+            raise WorkError(f"{self.name} {ended}: {self.last_message()}")
         return line
 
     @property
