@@ -7,7 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -129,6 +129,13 @@ def test_bad_runs(command: str, case: str, run: Run, tmp_path: Path) -> None:
     result = run(command, SWEEP if command == "sweep" else DEMO, *changes, "--out", "mine")
     assert reason in result.rejection()
     assert files(tmp_path) == {}
+
+
+@pytest.mark.parametrize("command", [("run", DEMO), ("sweep", SWEEP), ("boundary", BOUNDARY), ("study", STUDY)])
+def test_an_output_directory_with_an_impossible_name(command: Sequence[str], run: Run) -> None:
+    """An output directory whose name is too long is rejected in one sentence that names it."""
+    name = "a" * 300
+    assert f"{name} cannot be read (File name too long)" in run(*command, "--out", name).rejection()
 
 
 BAD_BOUNDARIES = {

@@ -13,7 +13,7 @@ from lavt.config import ClientConfig, SweepConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.experiment.runs.plan import plan_sweep
-from lavt.recording.output_directory import disk_errors_named, open_directory, reserve_directory
+from lavt.recording.output_directory import check_directory, disk_errors_named, open_directory, reserve_directory
 
 
 def register(app: typer.Typer) -> None:
@@ -65,6 +65,8 @@ def sweep(
     if cluster and any(run.config.time == "real" for run in planned_runs):
         raise UserError("--cluster needs virtual time: set time: virtual, or run without --cluster")
     out = out or Path("out") / "sweep"
+    if not resume:
+        check_directory(out)
     if cluster:
         check_cluster(cluster, jobs)
     remaining = sum(not is_finished(out / "runs" / run.name) for run in planned_runs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -36,7 +37,7 @@ def open_study(config: StudyConfig, blocks: Sequence[Block], out: Path) -> int:
 
     Raises `UserError` if `out` has another study, runs that are not in the plan, damaged files, or anything else.
     """
-    if not (out / STUDY).is_file():
+    if not os.path.isfile(out / STUDY):  # noqa: PTH113 (`Path.is_file` raises for a directory that cannot be read)
         prepare_directory(out)
     check_recorded_config(config, out / STUDY)
     check_order(blocks, out / "runs")
