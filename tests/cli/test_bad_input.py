@@ -531,6 +531,15 @@ def test_join_of_nothing(run: Run, tmp_path: Path) -> None:
     assert not (tmp_path / "joined").exists()
 
 
+@pytest.mark.parametrize("timeout", ["inf", "1e300", "nan", "0"])
+@pytest.mark.parametrize("command", [("stop", CLIENT), ("vehicles",)])
+def test_a_timeout_that_is_no_time(command: Sequence[str], timeout: str, run: Run) -> None:
+    """A timeout that is infinite, not a number, or zero ends with exit code 2 and an error about the option."""
+    result = run(*command, "--timeout", timeout)
+    assert result.code == 2
+    assert "Invalid value for '--timeout'" in result.err
+
+
 def test_unknown_command(run: Run) -> None:
     """An unknown command or option, or a missing argument, ends with exit code 2 and an error on standard error."""
     for arguments in (["fly"], ["run", DEMO, "--fast"], ["run"]):

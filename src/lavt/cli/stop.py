@@ -45,7 +45,10 @@ def register(app: typer.Typer) -> None:
 def stop(
     config: Annotated[Path, typer.Argument(help="A client config in YAML, such as configs/client.yaml.")],
     timeout: Annotated[
-        float, typer.Option(min=RETRY_PERIOD_S, help="How long to repeat the stop until the vehicle confirms it, in s.")
+        float,
+        typer.Option(
+            min=RETRY_PERIOD_S, max=86_400, help="How long to repeat the stop until the vehicle confirms it, in s."
+        ),
     ] = TIMEOUT_S,
     changes: console.SetOption = None,
 ) -> None:

@@ -62,7 +62,10 @@ def vehicles(
     ] = None,
     use_scouting: ScoutOption = False,
     timeout: Annotated[
-        float, typer.Option(min=0.1, help="How long to search, in s; an address that does not answer can take longer.")
+        float,
+        typer.Option(
+            min=0.1, max=86_400, help="How long to search, in s; an address that does not answer can take longer."
+        ),
     ] = TIMEOUT_S,
     changes: console.SetOption = None,
     as_json: console.JsonOption = False,
