@@ -20,14 +20,19 @@ SETTINGS = ("vehicle.scenery=none", "camera.width_px=320", "camera.height_px=240
 """Settings of a drive that leave processor time for a browser."""
 ATTEMPTS = 8
 REPEAT_KEYS = """(() => {
+  const {keyboard} = lavtConsole;
+  const advance = keyboard.advance;
   let newest = null;
   addEventListener("keydown", ({isTrusted, code}) => { if (isTrusted) newest = code; }, true);
   addEventListener("keyup", ({code}) => { if (code === newest) newest = null; }, true);
-  setInterval(() => {
+  keyboard.advance = (step_s) => {
     if (newest !== null) dispatchEvent(new KeyboardEvent("keydown", {code: newest, repeat: true, cancelable: true}));
-  }, 40);
+    advance.call(keyboard, step_s);
+  };
 })()"""
-"""Repeats the key that was pressed last, as a display server does, and the protocol of Chromium does not."""
+"""Repeats the key that was pressed last, as a display server does, and the protocol of Chromium does not.
+
+It does so before the page looks whether keys repeat: a page that was stopped has the repeats that came meanwhile."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
