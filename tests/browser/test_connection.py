@@ -125,6 +125,7 @@ def test_a_stop_without_a_connection_is_sent_later(page: ConnectedPage) -> None:
     assert "NOT sent" in page.text("hint")
     page.client = FakeClient(page.client.port)
     wait_until("the stop is sent", lambda: page.client.stops > 0)
+    wait_until("it is shown as not confirmed", lambda: "not confirmed" in page.text("hint"))
     page.pass_time(1.5)
     assert "not confirmed" in page.text("hint")
 
@@ -135,8 +136,8 @@ def test_a_page_without_a_place_tries_again(page: ConnectedPage, monkeypatch: py
     monkeypatch.setattr(console_link, "MAX_PAGES", 0)
     page.client = FakeClient(page.client.port)
     wait_until("the page is refused", lambda: "too many pages" in page.text("hint"))
-    page.stop()
-    assert "It is sent if" in page.text("hint")
+    page.stop()  # while the page tries again, it shows the stop when it is refused
+    wait_until("the page shows that the stop waits", lambda: "It is sent if" in page.text("hint"))
     monkeypatch.undo()
     wait_until("the stop is sent", lambda: page.client.stops > 0)
 
