@@ -19,6 +19,8 @@ TIMEOUT_S = 300
 SETTINGS = ("vehicle.scenery=none", "camera.width_px=320", "camera.height_px=240")
 """Settings of a drive that leave processor time for a browser."""
 ATTEMPTS = 8
+NEW_INPUT_US = 300_000
+"""A hand that the client sees this long after a time is of an input since then: an older one counts for 200 ms."""
 REPEAT_KEYS = """(() => {
   const {keyboard} = lavtConsole;
   const advance = keyboard.advance;
@@ -33,6 +35,7 @@ REPEAT_KEYS = """(() => {
 """Repeats the key that was pressed last, as a display server does, and the protocol of Chromium does not.
 
 It does so before the page looks whether keys repeat: a page that was stopped has the repeats that came meanwhile."""
+
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -140,6 +143,28 @@ def drive_until(
             return
         release_all()
     pytest.fail(f"the car did not drive in {ATTEMPTS} attempts")
+
+
+def commands_acceleration_to_the_left(tab: Tab) -> bool:
+    """Return whether the last command has much throttle, and steers to the left."""
+    steering_rad, throttle, _ = field(tab, "command") or (0, 0, 0)
+    return bool(steering_rad > 0.1 and throttle > 0.9)
+
+
+def wait_until_open(tab: Tab) -> None:
+    """Wait until the client sees an open hand in inputs that the page sends from now on; fail if the hand holds.
+
+    If the page or the client pauses, the client sees no input for a moment.
+    """
+    since_us = field(tab, "sent_us")
+
+    def is_open() -> bool:
+        newest = status(tab) or {}
+        assert newest.get("hand") != "held"
+        return newest.get("hand") == "open" and newest["sent_us"] > since_us + NEW_INPUT_US
+
+    wait_until("the hand is seen open", is_open)
+    assert field(tab, "safety") == "safe_stop"
 
 
 def press(tab: AnyTab, *codes: str) -> None:

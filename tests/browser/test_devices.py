@@ -6,7 +6,13 @@ import json
 from typing import Any
 
 from tests.browser.chromium import Tab, wait_until
-from tests.browser.conftest import PersonDrive, drive_until, field
+from tests.browser.conftest import (
+    PersonDrive,
+    commands_acceleration_to_the_left,
+    drive_until,
+    field,
+    wait_until_open,
+)
 
 GAMEPAD = {"id": "pad", "mapping": "standard", "axes": [0, 0, 0, 0], "buttons": [0] * 17}
 WHEEL = {"id": "wheel", "mapping": "", "axes": [0, 0, 0], "buttons": [0] * 4}
@@ -51,18 +57,22 @@ def arm(tab: Tab, held: dict[str, Any]) -> None:
 def test_a_gamepad_drives_until_it_is_unplugged(person_drive: PersonDrive) -> None:
     """A known gamepad drives without calibration; if it is unplugged, the car stops, and only a fresh press counts."""
     tab = person_drive.open()
+    held = moved(GAMEPAD, buttons=(RB,))
+
+    def accelerates_to_the_left() -> bool:
+        if field(tab, "safety") == "driving":
+            plug(tab, moved(GAMEPAD, axes={0: -1.0}, buttons=(RB, RT)))
+        return commands_acceleration_to_the_left(tab)
+
     plug(tab, GAMEPAD)
-    arm(tab, moved(GAMEPAD, buttons=(RB,)))
-    plug(tab, moved(GAMEPAD, axes={0: -1.0}, buttons=(RB, RT)))
-    wait_until("it accelerates to the left", lambda: tuple(field(tab, "command") or (0, 0))[:2] > (0.1, 0.9))
+    drive_until(tab, lambda: plug(tab, held), lambda: plug(tab, GAMEPAD), accelerates_to_the_left)
     plug(tab, None)
     wait_until("the car stops", lambda: field(tab, "safety") == "safe_stop")
-    plug(tab, moved(GAMEPAD, buttons=(RB,)))
+    plug(tab, held)
     wait_until("the car is stationary", lambda: field(tab, "phase") == "arming")
-    let_time_pass(tab, 300)
-    assert (field(tab, "hand"), field(tab, "safety")) == ("open", "safe_stop")
+    wait_until_open(tab)
     plug(tab, GAMEPAD)
-    arm(tab, moved(GAMEPAD, buttons=(RB,)))
+    arm(tab, held)
 
 
 def test_the_button_of_a_gamepad_stops(person_drive: PersonDrive) -> None:

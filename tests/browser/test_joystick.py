@@ -8,7 +8,13 @@ from typing import Any
 
 import pytest
 from tests.browser.chromium import Tab, running_browser, wait_until
-from tests.browser.conftest import PersonDrive, drive_until, field
+from tests.browser.conftest import (
+    PersonDrive,
+    commands_acceleration_to_the_left,
+    drive_until,
+    field,
+    wait_until_open,
+)
 from tests.browser.joystick import FULL, PACKAGES, Joystick, is_missing, joystick
 from tests.require import need
 
@@ -68,7 +74,7 @@ def test_a_real_joystick_drives_until_it_is_unplugged(pad: Joystick, person_driv
         if field(tab, "safety") == "driving":
             pad.axis(STEERING, -FULL)
             pad.axis(THROTTLE, FULL)
-        return tuple(field(tab, "command") or (0, 0))[:2] > (0.1, 0.9)
+        return commands_acceleration_to_the_left(tab)
 
     with running_browser(tmp_path / "chromium", environment=pad.environment) as browser:
         tab = person_drive.open(browser)
@@ -85,7 +91,6 @@ def test_a_real_joystick_drives_until_it_is_unplugged(pad: Joystick, person_driv
         pad.axis(THROTTLE, -FULL)
         pad.plug()  # the button is still pressed, which the browser hides until it has been released
         wait_until("the browser has found the gamepad", lambda: gamepads(tab) != [])
-        let_time_pass(tab)
-        assert (field(tab, "hand"), field(tab, "safety")) == ("open", "safe_stop")
+        wait_until_open(tab)
         let_go()
         drive_until(tab, hold, let_go, lambda: bool(field(tab, "safety") == "driving"))
