@@ -83,7 +83,7 @@ def test_the_button_of_a_gamepad_stops(person_drive: PersonDrive) -> None:
 
 
 def test_a_wheel_drives_after_its_calibration(person_drive: PersonDrive) -> None:
-    """An unknown wheel is not used before its calibration; then inverted pedals at any rest position work."""
+    """An unknown wheel does nothing until its calibration ends; then inverted pedals at any rest position work."""
     tab = person_drive.open()
     rest = moved(WHEEL, axes={1: 1.0, 2: -1.0})  # the throttle is inverted
     plug(tab, moved(rest, axes={0: 1.0}))
@@ -104,6 +104,9 @@ def test_a_wheel_drives_after_its_calibration(person_drive: PersonDrive) -> None
     plug(tab, moved(rest, axes={0: -1.0, 1: 0.0}, buttons=(0,)))
     wait_until("it steers to the left", lambda: tab.evaluate("document.querySelector('#steering').value") == -1)
     assert 0.4 < tab.evaluate("document.querySelector('#throttle').value") < 0.55
+    assert field(tab, "emergency_stop") == "none"
+    plug(tab, moved(rest, buttons=(3,)))
+    wait_until("the stop is confirmed", lambda: field(tab, "emergency_stop") == "confirmed")
     tab.evaluate("localStorage.clear()")
 
 

@@ -74,6 +74,11 @@ export class Gamepads {
     this.#wasStopped = stops;
   }
 
+  // A calibration has ended: the button that has answered its last question stops only when it is pressed again.
+  endCalibration() {
+    this.#wasStopped = true;
+  }
+
   // A pedal that has not moved since the page was loaded reads the middle of its way, so it must have been at rest.
   #pedal(device, calibration, name) {
     const value = deflection(device, calibration[name]);

@@ -123,7 +123,10 @@ function sendInput() {
   advanced_ms = now_ms;
   if (calibration === null) gamepads.poll();
   else calibration.poll();
-  if (calibration?.next === null) calibration = null;
+  if (calibration?.next === null) {
+    calibration = null;
+    gamepads.endCalibration();
+  }
   sources.poll();
   if (status?.role !== "drives") return;
   const { steering, throttle, brake } = sources.current;
