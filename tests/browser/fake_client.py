@@ -61,7 +61,8 @@ class FakeClient:
         """Values of the status that differ from `STATUS`."""
         self.inputs: list[PageInput] = []
         self.stops = 0
-        self._marks = 0
+        self.marks = 0
+        """How many messages without a meaning have arrived, each after all that the page has sent before."""
         self._link.start(self._deliver)
 
     def _deliver(self, channel: str, payload: Any, now: Now, page: Any) -> None:
@@ -70,7 +71,7 @@ class FakeClient:
             if isinstance(message, PageInput):
                 self.inputs.append(message)
             elif isinstance(message, PageDelay):
-                self._marks += 1
+                self.marks += 1
             elif isinstance(message, PageStop):
                 self.stops += 1
                 if self.confirms_stops:
@@ -88,9 +89,9 @@ class FakeClient:
 
     def wait_for_sent(self, tab: Tab) -> None:
         """Wait until all that the page has sent so far has arrived: a message that is sent now arrives after it."""
-        before = self._marks
+        before = self.marks
         tab.evaluate("lavtConsole.send({type: 'delay', video_ms: 0, control_ms: 0})")
-        wait_until("what the page has sent has arrived", lambda: self._marks > before)
+        wait_until("what the page has sent has arrived", lambda: self.marks > before)
 
     def close(self) -> None:
         """End the link."""

@@ -14,9 +14,6 @@ from tests.browser.conftest import plug_gamepad, unplug_gamepads
 from tests.browser.fake_client import FakeClient, wait_until_loaded
 from tests.browser.x_keyboard import grabbed_keyboard, without_repeats
 
-from lavt.clock import pause
-from lavt.domain import NS_PER_S
-
 IN_PAGE = ("mousemove", "500", "450")
 RIGHT, PRESS = ("click", "3"), ("mousedown", "1")
 GRABS = {
@@ -37,6 +34,22 @@ KEEP_HINTS = """(() => {
   new MutationObserver(() => hints.push(hint.textContent)).observe(hint, {childList: true});
 })()"""
 """Keeps every text that the page shows as its hint from now on, however short."""
+
+STANDS_STILL = 1.0
+"""The target speed with which the client tells the page that the display server hangs."""
+RELEASE_LATER = """(() => {
+  let frame_ms = performance.now();
+  const note = () => { frame_ms = performance.now(); requestAnimationFrame(note); };
+  note();
+  const timer = setInterval(() => {
+    if (lavtConsole.status?.target_mps !== 1 || performance.now() - frame_ms < 1000) return;
+    clearInterval(timer);
+    lavtConsole.send({type: "delay", video_ms: 0, control_ms: 0});
+    setTimeout(() => { pad.buttons[5].value = 0; }, 1000);
+  }, 20);
+})()"""
+"""Once the display server hangs, and no picture of the screen was made for a second, sends a mark, which arrives after
+all inputs so far, and releases the gamepad a second later."""
 
 ATTEMPTS = 4
 """On a busy machine, repeats of keys are late at times."""
@@ -217,16 +230,18 @@ def test_a_screen_that_stands_still_drives_no_more(window: Window) -> None:
     plug_gamepad(window.tab, is_held=False)
     plug_gamepad(window.tab, is_held=True)
     window.wait_for_hold(is_held=True)
-    window.tab.evaluate("setTimeout(() => { pad.buttons[5].value = 0; }, 3000); 0")
+    window.tab.evaluate(RELEASE_LATER)
     window.server.send_signal(signal.SIGSTOP)
     try:
-        pause(NS_PER_S)
+        marks = window.client.marks
+        window.client.changes = {"target_mps": STANDS_STILL}
+        wait_until("the page has seen no picture of the screen for a while", lambda: window.client.marks > marks)
         sent = len(window.client.inputs)
-        pause(NS_PER_S)
+        wait_until("the release arrives", lambda: len(window.client.inputs) > sent)
         assert not any(each.held for each in window.client.inputs[sent:])
-        window.wait_for_hold(is_held=False)
     finally:
         window.server.send_signal(signal.SIGCONT)
+        window.client.changes = {}
         unplug_gamepads(window.tab)
 
 
