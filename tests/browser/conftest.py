@@ -37,6 +37,25 @@ REPEAT_KEYS = """(() => {
 It does so before the page looks whether keys repeat: a page that was stopped has the repeats that came meanwhile."""
 
 
+WATCH_PICTURES = """(() => {
+  globalThis.pictures = {drawn: 0, reported: 0, overdrawn: 0};
+  const drawn_us = [];
+  const send = WebSocket.prototype.send;
+  WebSocket.prototype.send = function (data) {
+    const message = JSON.parse(data);
+    if (message.type === "ack") {
+      pictures.drawn += 1;
+      drawn_us.push(Math.round((performance.timeOrigin + performance.now()) * 1000));
+    }
+    if (message.type === "shown") {
+      pictures.reported += 1;
+      pictures.overdrawn += drawn_us.some((newer_us) => message.drawn_us < newer_us && newer_us < message.shown_us);
+    }
+    send.call(this, data);
+  };
+})()"""
+"""Counts the pictures that the page draws, those that it reports as shown, and those of them that were drawn over."""
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
@@ -125,6 +144,16 @@ def status(tab: AnyTab) -> dict[str, Any] | None:
 def field(tab: AnyTab, name: str) -> Any:
     """Return one value of the page's newest status; None while it is not connected."""
     return (status(tab) or {}).get(name)
+
+
+def watch_pictures(tab: AnyTab) -> None:
+    """Let the page count from now on what becomes of its pictures, for `pictures`."""
+    tab.evaluate(WATCH_PICTURES)
+
+
+def pictures(tab: AnyTab, name: str) -> int:
+    """Return how many pictures the page has "drawn", "reported" as shown, or reported although "overdrawn" before."""
+    return int(tab.evaluate(f"pictures.{name}"))
 
 
 def drive_until(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from tests.browser.chromium import wait_until
-from tests.browser.conftest import PersonDrive, field, press, release, repeat_keys
+from tests.browser.conftest import PersonDrive, field, pictures, press, release, repeat_keys, watch_pictures
 from tests.browser.fake_client import FakeClient
 from tests.browser.firefox import PACKAGES, PREFERENCES, FirefoxTab, is_missing, running_firefox
 from tests.require import need
@@ -31,7 +31,9 @@ def test_firefox_decodes_and_reads_every_stamp(person_drive: PersonDrive, tmp_pa
     """The page in Firefox shows the video, and the stamps that it reads are those that the client reads."""
     with running_firefox(tmp_path / "firefox") as tab:
         tab.navigate(person_drive.url)
-        wait_until("pictures are shown", lambda: shown(tab) > 30, LIMIT_S)
+        wait_until("pictures are shown", lambda: shown(tab) > 0, LIMIT_S)
+        watch_pictures(tab)
+        wait_until("pictures are reported", lambda: pictures(tab, "reported") > 30, LIMIT_S)
         assert field(tab, "role") == "drives"
     person_drive.process.end()
     counts = read_record(person_drive.out / "client" / "client.mcap").table("counts")

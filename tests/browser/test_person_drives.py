@@ -9,13 +9,12 @@ import pytest
 import yaml
 from pydantic import BaseModel
 from tests.browser.chromium import Browser, Tab, running_browser, wait_until
-from tests.browser.conftest import PersonDrive, arm, drive_off, field
+from tests.browser.conftest import PersonDrive, arm, drive_off, field, pictures, status, watch_pictures
 from tests.support.stalls import Stalls
 
 from lavt.clock import MachineClock
 from lavt.config import RunConfig
 from lavt.config_file import build_config
-from lavt.domain import NS_PER_MS
 from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.runs.processes import Process, Processes
 from lavt.experiment.runs.side_configs import client_config, embedded_router, server_config
@@ -23,18 +22,21 @@ from lavt.recording.record import read_record
 
 
 def wait_for_standstill(tab: Tab) -> None:
-    wait_until(
-        "the car is stationary", lambda: field(tab, "safety") == "safe_stop" and abs(field(tab, "speed_mps")) < 0.05
-    )
+    def is_stationary() -> bool:
+        newest = status(tab) or {}
+        return newest.get("safety") == "safe_stop" and abs(newest["speed_mps"]) < 0.05
+
+    wait_until("the car is stationary", is_stationary)
 
 
 def test_a_person_arms_drives_and_stops(person_drive: PersonDrive) -> None:
     """Holding the space bar arms, the arrow key accelerates, its release stops; the video is shown; all is timed."""
     tab = person_drive.open()
     assert field(tab, "role") == "drives"
+    watch_pictures(tab)
     drive_off(tab)
-    shown = tab.evaluate("lavtConsole.video.shown")
-    wait_until("pictures are shown", lambda: tab.evaluate("lavtConsole.video.shown") > shown + 20)
+    reported = pictures(tab, "reported")
+    wait_until("pictures are shown", lambda: pictures(tab, "reported") > reported + 20)
     assert tab.evaluate("lavtConsole.video.errors") == 0
     wait_until("losses are measured", lambda: field(tab, "lost_share") is not None)
     assert tab.evaluate("document.querySelector('#picture').width") == 320
@@ -55,36 +57,37 @@ def test_a_person_arms_drives_and_stops(person_drive: PersonDrive) -> None:
 def test_the_page_reads_every_stamp(person_drive: PersonDrive) -> None:
     """The page reads the stamps that the client reads, and the times at which it had the pictures are in order."""
     tab = person_drive.open()
-    wait_until("pictures are shown", lambda: tab.evaluate("lavtConsole.video.shown") > 60)
+    watch_pictures(tab)
+    wait_until("pictures are reported", lambda: pictures(tab, "reported") > 60)
     person_drive.process.end()
     record = read_record(person_drive.out / "client" / "client.mcap")
     counts = record.table("counts")
     assert max(value or 0 for value in counts.objects("page_stamps_true")) > 30
     assert not any(counts.objects("page_stamps_false"))
-    pictures = record.table("page_picture")
+    rows = record.table("page_picture")
     names = ("stamp_ns", "arrived_wall_ns", "decoded_wall_ns", "drawn_wall_ns", "shown_wall_ns")
-    times = [pictures.ints(name) for name in names]
-    bound = pictures.ints("bound_ns")
+    times = [rows.ints(name) for name in names]
+    bound = rows.ints("bound_ns")
     assert (times[1] >= times[0] - bound).all()
     for before, after in pairwise(times[1:]):
         assert (after >= before).all()
 
 
-def test_a_picture_that_never_appeared_has_no_times(person_drive: PersonDrive, stalls: Stalls) -> None:
+def test_a_picture_that_never_appeared_has_no_times(person_drive: PersonDrive) -> None:
     """A picture over which a newer one is drawn before the browser's next picture of the screen is not recorded."""
     tab = person_drive.open()
+    watch_pictures(tab)
+    wait_until("pictures are reported", lambda: pictures(tab, "reported") > 0)
     tab.evaluate(
         "const next = requestAnimationFrame;"
         "window.requestAnimationFrame = (show) => setTimeout(() => next(show), 500); undefined"
     )
-    since_ns = MachineClock().now().mono_ns
-    shown = tab.evaluate("lavtConsole.video.shown")
-    wait_until("pictures are drawn", lambda: tab.evaluate("lavtConsole.video.shown") > shown + 40)
-    person_drive.close()  # while pictures come: the last one of the drive appears
+    drawn = pictures(tab, "drawn")
+    wait_until("pictures are drawn", lambda: pictures(tab, "drawn") > drawn + 40)
     person_drive.process.end()
-    pictures = read_record(person_drive.out / "client" / "client.mcap").table("page_picture")
-    with stalls.excusing_failures(since_ns):  # the newest picture appears if no other follows for 500 ms
-        assert (pictures.ints("shown_wall_ns") - pictures.ints("drawn_wall_ns") < 400 * NS_PER_MS).all()
+    assert pictures(tab, "overdrawn") == 0
+    recorded = len(read_record(person_drive.out / "client" / "client.mcap").table("page_picture"))
+    assert recorded > 0
 
 
 def test_after_a_stop_the_person_drives_again(person_drive: PersonDrive) -> None:
