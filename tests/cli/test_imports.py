@@ -139,3 +139,14 @@ def test_ctrl_c_while_a_command_ends() -> None:
     )
     assert completed.stdout.startswith("lavt ")
     assert (completed.returncode, completed.stderr) == (130, "")
+
+
+@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
+def test_closed_standard_streams(closed: tuple[int, ...]) -> None:
+    """A command whose standard streams are closed runs, and rejects wrong input with exit code 2."""
+    closing = " ".join(f"{number}>&-" for number in closed)
+    command = f'exec "$0" -m lavt server missing.yaml {closing}'
+    result = subprocess.run(["/bin/sh", "-c", command, sys.executable], capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr
+    assert 2 in closed or "missing.yaml cannot be read" in result.stderr
