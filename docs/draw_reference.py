@@ -49,7 +49,7 @@ important ones at work. {SOURCE}
 - `lavt COMMAND --help` prints the same.
 - Results go to standard output or to files, messages to standard error.
 - The exit code is 0 when the job is done, 2 when the input is wrong, and 1 when the work failed.
-- After Ctrl-C it is 0 for a command that runs until then, 1 for stopped work, and 130 before the work has begun.
+- After Ctrl-C it is 0 for a command that runs until Ctrl-C, 1 for runs that were stopped, and 130 otherwise.
 - `--set a.b=c` replaces a value of the config, such as `--set network.condition=L2` ([configs.md](configs.md)).
 """
 
