@@ -389,6 +389,8 @@ class Device:
     """Results of the next reads; errors are raised."""
     open_error: Exception | None = None
     send_error: Exception | None = None
+    openings: int = 0
+    """How often opening has begun."""
     opened: int = 0
     shut_down: int = 0
     may_open: threading.Event = field(default_factory=threading.Event)
@@ -416,6 +418,7 @@ class BreakableBus(can.BusABC):
 
     def __init__(self, channel: str, **_: Any) -> None:
         self.device = DEVICES[channel]
+        self.device.openings += 1
         assert self.device.may_open.wait(DEADLINE_S)
         if self.device.open_error:
             raise self.device.open_error
@@ -502,8 +505,7 @@ def test_a_slow_opening_blocks_nobody(open_port: Callable[..., CanPort], device:
     port = open_port("breakable", "stick", clock=ManualClock(0))
     device.may_open.clear()
     device.incoming.append(OSError(errno.ENODEV, "gone"))
-    until(lambda: device.shut_down == 1)
-    pause(3 * bus_module.REOPEN_NS)
+    until(lambda: (device.shut_down, device.openings) == (1, 2))
     for _ in range(100):
         with pytest.raises(BusGone):
             port.take(10 * NS_PER_S)
@@ -559,8 +561,7 @@ def test_a_bus_opened_during_a_suspension_is_opened_again(open_port: Callable[..
     port = open_port("breakable", "stick", clock=ManualClock(0), read_suspended_ns=lambda: suspended[0])
     device.may_open.clear()
     device.incoming.append(OSError(errno.ENODEV, "gone"))
-    until(lambda: device.shut_down == 1)
-    pause(3 * bus_module.REOPEN_NS)
+    until(lambda: (device.shut_down, device.openings) == (1, 2))
     suspended[0] = NS_PER_S
     with pytest.raises(BusGone):
         port.take(0)
