@@ -23,6 +23,8 @@ PACKET_HEADER = struct.Struct(">8sIq")
 """Mark of the flow, packet number, and send time (wall clock, ns)."""
 DRAIN_S = 0.35
 """Time to wait for packets after the last one was sent."""
+LONGEST_POLL_NS = 20 * NS_PER_MS
+"""A longer poll shows a stall of the machine, in which packets are delayed like the poll; the rest does not count."""
 _CLONE_NEWNET = 0x40000000
 _ALL_PROTOCOLS = 3
 _SO_RCVBUFFORCE = 33
@@ -167,10 +169,7 @@ def send_flows(
                 _receive(captures, names, arrivals)
         for thread in threads:
             thread.join()
-        end_ns = clock.now().mono_ns + round(DRAIN_S * NS_PER_S)
-        while clock.now().mono_ns < end_ns:
-            _receive(captures, names, arrivals)
-            pause(NS_PER_MS)
+        _drain(captures, names, arrivals)
     finally:
         for flow_sockets in sockets:
             flow_sockets.close()
@@ -225,6 +224,16 @@ def _open_capture(device: str) -> socket.socket:
     capture.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, 4 << 20)
     capture.setblocking(False)
     return capture
+
+
+def _drain(captures: dict[str, socket.socket], names: dict[bytes, str], arrivals: dict[str, Arrivals]) -> None:
+    """Receive the packets that are still on their way; a stall of the machine does not shorten the wait."""
+    clock, remaining_ns = MachineClock(), round(DRAIN_S * NS_PER_S)
+    while remaining_ns > 0:
+        began_ns = clock.now().mono_ns
+        pause(NS_PER_MS)
+        _receive(captures, names, arrivals)
+        remaining_ns -= min(clock.now().mono_ns - began_ns, LONGEST_POLL_NS)
 
 
 def _receive(captures: dict[str, socket.socket], names: dict[bytes, str], arrivals: dict[str, Arrivals]) -> None:
