@@ -124,13 +124,17 @@ def sessions(
     tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Callable[..., PlannedRun], stalls: Stalls
 ) -> SharedResult[Session]:
     """Run a session in which control of the vehicle goes from one client to another."""
+    clock = MachineClock()
 
     def run() -> Session:
         work = tmp_path_factory.mktemp("session")
-        with Processes(work) as processes:
+        # A stall can stop the vehicle, and then no client drives on by itself: the session never reaches its end.
+        excusing = stalls.excusing_failures(clock.now().mono_ns, stall_ms=LONG_STALL_MS)
+        with excusing, Processes(work) as processes:
             session = Session(
                 processes, work, wait_until, planned("vehicle.scenery=none", "controller.preset=designed")
             )
+            session.at_ns["began"] = clock.now().mono_ns
             first = session.start_client("first", "operator-1")
             session.observations["first without a router"] = first.last_message()
             server = session.start_server()
@@ -191,16 +195,16 @@ def test_a_client_started_before_its_router_and_server_drives(session: Session, 
     assert event_ns(server, "arming -> driving")
 
 
-def test_a_second_client_learns_who_has_control(session: Session) -> None:
+def test_a_second_client_learns_who_has_control(session: Session, stalls: Stalls) -> None:
     """Without take-over a second client learns who has control, requests no handover, and ends with exit code 0."""
     assert session.observations["waiting"]["phase"] == "seeking"
     assert session.observations["waiting"]["active_operator"] == "operator-1"
     at_server = session.observations["server while it waits"]
-    assert (at_server["safety"], at_server["active_operator"], at_server["requested_by"]) == (
-        "driving",
-        "operator-1",
-        "",
-    )
+    assert (at_server["active_operator"], at_server["requested_by"]) == ("operator-1", "")
+    with stalls.excusing_failures(
+        session.at_ns["began"], session.at_ns["waiting interrupted"], stall_ms=LONG_STALL_MS
+    ):  # a stall can stop the vehicle
+        assert at_server["safety"] == "driving"
     assert session.codes["waiting"] == 0
 
 
@@ -212,7 +216,8 @@ def test_the_active_operator_hands_over_on_request(session: Session, server: Rec
     first = session.observations["first after handover"]
     assert (first["phase"], first["session"]) == ("watching", "released")
     released_ns = event_ns(server, "release", "operator-1", "granted")
-    assert event_ns(server, "driving -> safe_stop") >= released_ns
+    with stalls.excusing_failures(session.at_ns["began"], released_ns, stall_ms=LONG_STALL_MS):  # it can stop before
+        assert event_ns(server, "driving -> safe_stop") >= released_ns
     acquired_ns = event_ns(server, "acquire", "operator-2", "granted")
     assert acquired_ns >= released_ns
     with stalls.excusing_failures(released_ns, acquired_ns, stall_ms=LONG_STALL_MS):
