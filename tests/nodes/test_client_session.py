@@ -147,10 +147,11 @@ def test_two_servers_of_one_name_await_a_person(rearm: bool) -> None:
     assert (session.phase, session.may_command, session.take_request(10 * NS_PER_S)) == ("stopped", False, None)
 
 
-def test_a_client_that_waits_for_one_of_two_servers_does_not_arm() -> None:
-    """A client that sees two servers of one name before it drives does not arm either of them."""
+@pytest.mark.parametrize("servers", [2, 3, 8])
+def test_a_client_that_waits_for_one_of_several_servers_does_not_arm(servers: int) -> None:
+    """A client that sees several servers of one name in turns, before it drives, does not arm any of them."""
     session = new_session()
-    for time_ns, instance in enumerate((1, 2, 1)):
+    for time_ns, instance in enumerate((*range(1, servers + 1), 1)):
         session.handle_reply(GRANTED, time_ns)
         session.handle_state(replace(state("disarmed"), instance=instance), time_ns)
     assert (session.phase, session.reason) == ("stopped", SAME_NAME + RESTART_HINT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Literal
 
 from lavt.domain import NS_PER_S, Now, Operation, SessionReply, SessionRequest, State
@@ -16,6 +17,8 @@ lost for good."""
 
 REQUEST_PERIOD_NS = NS_PER_S
 RESTART_HINT = "; restart this client to drive"
+MAX_SERVERS = 8
+"""How many former server processes a client remembers."""
 SAME_NAME = "several servers have this vehicle's name: end all but one, or give each another vehicle_id"
 
 
@@ -25,8 +28,8 @@ class ClientSession:
     With `rearm`, it requests control again after a safe stop and from a restarted server. With `clear_stop`, it clears
     the emergency stop that the first reply reports, and no other one. After any other emergency stop, and after a
     driver override, it never arms the vehicle again: not if it has not driven yet, if somebody clears the stop, or if
-    the server restarts and has forgotten the stop. The same holds if states of two servers alternate: they have the
-    same name, and each has another vehicle. With `waits_for_condition`, it arms the vehicle only when the network
+    the server restarts and has forgotten the stop. The same holds if states of several servers alternate: they have
+    the same name, and each has another vehicle. With `waits_for_condition`, it arms the vehicle only when the network
     condition is in force. With `take_over`, it requests a handover from the active operator.
     """
 
@@ -73,10 +76,10 @@ class ClientSession:
         """A state has named this client as the active operator."""
         self._server = 0
         """Instance of the server process that sent the last state."""
-        self._former_server: int | None = None
-        """Instance of the server process that sent states before that one; None: there was none."""
-        self._has_two_servers = False
-        """The states of two servers have alternated."""
+        self._former_servers: deque[int] = deque(maxlen=MAX_SERVERS)
+        """Instances of the server processes that sent states before that one."""
+        self._has_several_servers = False
+        """States of several servers have alternated."""
         self._state_reason = ""
         """Reason in the last state."""
         self._awaits_person = False
@@ -210,7 +213,7 @@ class ClientSession:
         if self.safety == "":  # the first state can tell of what happened before this client started
             return
         is_restarted = state.instance != self._server
-        forgets_stop = is_restarted and not self._has_two_servers
+        forgets_stop = is_restarted and not self._has_several_servers
         if forgets_stop and self.safety == "emergency_stop" and not self._looks_for_stop:
             self._await_person("the server has restarted in an emergency stop")
         if state.safety == "disarmed":
@@ -221,13 +224,13 @@ class ClientSession:
                 self._await_person(state.reason)
 
     def _notice_other_server(self, state: State) -> None:
-        """Notice that two servers have the same name: a server that has restarted never sends a state again."""
+        """Notice that several servers have the same name: after a restart, the former process sends no states."""
         if self.safety == "" or state.instance == self._server:
             return
-        if state.instance == self._former_server and not self._has_two_servers:
-            self._has_two_servers = True
+        if state.instance in self._former_servers and not self._has_several_servers:
+            self._has_several_servers = True
             self._await_person(SAME_NAME)
-        self._former_server = self._server
+        self._former_servers.append(self._server)
 
     def _await_person(self, reason: str) -> None:
         """Do not arm the vehicle from now on: a person must decide what follows, and restart this client."""
