@@ -366,7 +366,7 @@ def test_report_of_a_boundary_without_a_sweep(run: Run, tmp_path: Path) -> None:
 def test_nothing_to_resume(run: Run, tmp_path: Path, command: tuple[str, ...]) -> None:
     """A sweep or a search that was never begun in a directory cannot be resumed there."""
     (tmp_path / "photos").mkdir()
-    for name in ("never", "photos"):
+    for name in ("never", "photos", "a" * 300):
         assert f"nothing to resume in {name}" in run(*command, "--resume", "--out", name).rejection()
     assert files(tmp_path) == {"photos": None}
 

@@ -12,7 +12,7 @@ from lavt.cli.progress import progress
 from lavt.config import BoundaryConfig
 from lavt.config_file import load_config
 from lavt.errors import WorkError
-from lavt.recording.output_directory import disk_errors_named, open_directory, reserve_directory
+from lavt.recording.output_directory import check_output, disk_errors_named, make_directory, reserve_directory
 
 
 def register(app: typer.Typer) -> None:
@@ -42,7 +42,8 @@ def boundary(
     settings = load_config(BoundaryConfig, config, changes or [])
     searches = plan_boundary(settings)
     out = out or Path("out") / "boundary"
-    open_directory(out, BOUNDARY_CONFIG, resume=resume)
+    check_output(out, BOUNDARY_CONFIG, resume=resume)
+    make_directory(out)
     found = read_found(out)
     remaining = sum(search.key not in found for search in searches)
     with (

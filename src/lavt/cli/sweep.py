@@ -13,7 +13,7 @@ from lavt.config import ClientConfig, SweepConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.experiment.runs.plan import plan_sweep
-from lavt.recording.output_directory import check_directory, disk_errors_named, open_directory, reserve_directory
+from lavt.recording.output_directory import check_output, disk_errors_named, make_directory, reserve_directory
 
 
 def register(app: typer.Typer) -> None:
@@ -65,8 +65,7 @@ def sweep(
     if cluster and any(run.config.time == "real" for run in planned_runs):
         raise UserError("--cluster needs virtual time: set time: virtual, or run without --cluster")
     out = out or Path("out") / "sweep"
-    if not resume:
-        check_directory(out)
+    check_output(out, SWEEP, resume=resume)
     if cluster:
         check_cluster(cluster, jobs)
     remaining = sum(not is_finished(out / "runs" / run.name) for run in planned_runs)
@@ -74,7 +73,7 @@ def sweep(
         remote.check_connection()
     if remaining and not (remote or cluster):  # otherwise, the server may be reachable for other machines only
         check_carla_servers(run.config.vehicle for run in planned_runs)
-    open_directory(out, SWEEP, resume=resume)
+    make_directory(out)
     with (
         reserve_directory(out),
         disk_errors_named(out),

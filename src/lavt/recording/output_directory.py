@@ -38,14 +38,14 @@ def make_directory(out: Path) -> None:
         raise UserError(f"{out} cannot be created ({error.strerror}): name another directory with --out") from error
 
 
-def open_directory(out: Path, config: str, *, resume: bool) -> None:
-    """Create the directory of new work; with `resume`, check that it has the file `config`, which stopped work leaves.
+def check_output(out: Path, config: str, *, resume: bool) -> None:
+    """Raise `UserError` unless new work can begin in `out`, or with `resume`, unless `out` has the file `config`.
 
-    Raises `UserError` if there is nothing to resume, or if the directory cannot be created.
+    Stopped work leaves this file.
     """
     if not resume:
-        prepare_directory(out)
-    elif not (out / config).is_file():
+        check_directory(out)
+    elif not os.path.isfile(out / config):  # noqa: PTH113 (`Path.is_file` raises for a directory that cannot be read)
         raise UserError(f"there is nothing to resume in {out}: omit --resume to begin")
 
 
